@@ -176,17 +176,17 @@ _PIXEL_SECONDS = 1e-8
 def check_simulation_size(
     runs: int, samples: int, seconds: float, simulator: Simulator, force: bool = False
 ) -> None:
-    """Refuse a recording that this machine cannot simulate.
+    """Refuse to simulate a recording for which this machine has too few resources.
 
     The need for memory, disk and time is estimated from the number of samples and of simulation
-    steps, before anything is simulated.
+    steps, before anything is simulated. Only one run is simulated at a time.
 
     Args:
         runs: Number of runs.
         samples: Number of samples of each run.
         seconds: Duration of each run.
         simulator: Simulator of the recording.
-        force: Whether the user insists.
+        force: Whether to skip the check.
 
     Raises:
         InputError: It needs more than is available; the message is one line.
@@ -209,24 +209,24 @@ def check_simulation_size(
 
 
 def check_recording_size(recording: Recording, simulator: Simulator, force: bool = False) -> None:
-    """Refuse a recording that this machine cannot fit.
+    """Refuse to fit a recording for which this machine has too few resources.
 
-    A fit simulates each run many times, several of them at once. Its minimum need is estimated
-    from the longest run.
+    A fit simulates each run many times, several of them at once. Its minimum need is estimated as
+    if all runs were as long as the longest one.
 
     Args:
         recording: Recording to explain or score.
         simulator: Simulator to fit.
-        force: Whether the user insists.
+        force: Whether to skip the check.
 
     Raises:
         InputError: It needs more than is available; the message is one line.
     """
-    longest = max(float(run.times[-1] - run.times[0]) for run in recording.runs)
-    steps = longest / get_max_step(simulator)
+    seconds = max(float(run.times[-1] - run.times[0]) for run in recording.runs)
+    steps = seconds / get_max_step(simulator)
     count = len(recording.runs)
     need = ResourceNeed(
-        f"{count} runs of up to {longest:.4g} s, {steps:.3g} steps,",
+        f"{count} runs of up to {seconds:.4g} s, {steps:.3g} steps,",
         "explain shorter runs",
         memory=count * _MIN_SIMULTANEOUS_SIMULATIONS * steps * BYTES_PER_STEP,
         steps=steps,
@@ -236,13 +236,13 @@ def check_recording_size(recording: Recording, simulator: Simulator, force: bool
 
 
 def check_film_size(recording: Path, frames: int, pixels: int, force: bool = False) -> None:
-    """Refuse a film that this machine cannot render.
+    """Refuse to render a film for which this machine has too few resources.
 
     Args:
         recording: Path of the recording to film.
         frames: Number of images.
         pixels: Width and height of each image.
-        force: Whether the user insists.
+        force: Whether to skip the check.
 
     Raises:
         InputError: It needs more than is available; the message is one line.

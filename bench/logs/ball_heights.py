@@ -105,14 +105,16 @@ def compute_heights_by_scale(
 ) -> BallHeights:
     """Compute heights without a camera, scaled by the ball's diameter or by the fall.
 
-    Up to the scale, the heights follow from equation (2) with q, the position along the fall over
-    the ball's radius, both in pixels. Only the factor S remains: the known radius, or the factor
-    with which the ball falls at g. If both are known but differ, a note says so.
+    The heights are z = radius + S (q_ground - q) (2), where q is the position along the fall
+    (downwards positive) divided by the ball's radius, both in pixels. The unknown factor S is the
+    known radius, or the factor with which the ball falls at g. If both are known but differ, a note
+    says so.
 
     Args:
         track: Track of the ball in the image.
         diameter: Diameter of the ball in metres; None to scale by the fall.
-        scale: "fall" to scale by the fall although a diameter is given.
+        scale: "fall" to scale by the fall although a diameter is given; any other value leaves the
+            choice to `diameter`.
 
     Raises:
         InputError: The film does not show what the method needs.
@@ -155,15 +157,15 @@ def _compute_fall_position(track: BallTrack) -> Array:
         track: Centres (u, v) of the ball in the T frames.
 
     Raises:
-        InputError: The line is closer to the horizontal.
+        InputError: The line is less than 30 degrees from the horizontal.
     """
     visible_frames = track.visible_frames
     points = np.stack([track.u[visible_frames], track.v[visible_frames]], axis=1)
     middle = points.mean(axis=0)
     # The line of the fall is the first principal axis of the points; v counts downwards.
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
-    axis = axes[0] * (1.0 if axes[0][1] >= 0 else -1.0)
-    if abs(axis[1]) < 0.5:
+    axis = axes[0] if axes[0][1] >= 0 else -axes[0]
+    if axis[1] < 0.5:
         raise InputError(
             "the ball moves across the picture rather than down; expected a drop filmed upright"
         )
@@ -174,8 +176,9 @@ def _compute_fall_position(track: BallTrack) -> Array:
 def _smooth_radius(track: BallTrack) -> Array:
     """Smooth the radius (T,) of the ball in pixels, as a linear function of its position.
 
-    The outline in a single frame is too noisy, so a line is fitted to the radii of all frames. It
-    is fitted several times; frames far from the previous line get a small weight.
+    Along a straight fall, the inverse depth and so the radius is linear in the position. The
+    outline in a single frame is too noisy, so a line is fitted to the radii of all frames. It is
+    fitted several times; frames far from the previous line get a small weight.
 
     Args:
         track: Centres and radii of the ball in the frames.
@@ -201,7 +204,7 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
 
     Args:
         times: (T,) times of the frames, s.
-        q: (T,) position downwards, in ball radii; NaN where the ball was not detected.
+        q: (T,) position downwards, in ball radii or metres; NaN where the ball was not detected.
     """
     visible_frames = np.flatnonzero(np.isfinite(q))
     last_index = len(visible_frames) - 1
@@ -222,12 +225,10 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
             continue
         flight_times = times[flight_frames]
         curve, squared_residuals, *_ = np.polyfit(flight_times, q[flight_frames], 2, full=True)
-        scatter = (
-            float(np.sqrt(squared_residuals[0] / len(flight_times)))
-            if len(squared_residuals)
-            else 0.0
-        )
+        # NumPy returns no residual if the points do not determine the parabola.
+        scatter = np.sqrt(squared_residuals[0] / len(flight_times)) if len(squared_residuals) else 0
         # A motion that is not a parabola is not a flight, but a hand, a roll or another ball.
+        # Admitted are 5 % of the extent, and 0.02 for errors of the outline.
         if scatter < 0.05 * np.ptp(q[flight_frames]) + 0.02:
             # The variance of a parabola's curvature goes as 1 / (n T^4), for n samples in T.
             weight = len(flight_times) * float(flight_times[-1] - flight_times[0]) ** 4
@@ -235,14 +236,14 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
     return flights
 
 
-def _compute_gravity_scale(arcs: list[_Flight]) -> float | None:
+def _compute_gravity_scale(flights: list[_Flight]) -> float | None:
     """Return the S for which the flights fall with gravity; None without a falling flight."""
-    falling_arcs = [arc for arc in arcs if arc.curve[0] > 0]
-    if not falling_arcs:
+    falling_flights = [flight for flight in flights if flight.curve[0] > 0]
+    if not falling_flights:
         return None
-    curvatures = [2 * arc.curve[0] for arc in falling_arcs]
-    mean = np.average(curvatures, weights=[arc.weight for arc in falling_arcs])
-    return float(DEFAULT_GRAVITY / mean)  # Equation (3).
+    accelerations = [2 * flight.curve[0] for flight in falling_flights]  # q''
+    mean = np.average(accelerations, weights=[flight.weight for flight in falling_flights])
+    return float(DEFAULT_GRAVITY / mean)  # Equation (3): q'' = g / S.
 
 
 def _estimate_ground_position(track: BallTrack, q: Array, flights: list[_Flight]) -> float:
@@ -250,7 +251,8 @@ def _estimate_ground_position(track: BallTrack, q: Array, flights: list[_Flight]
 
     It is where two successive flights meet: the bounce itself falls between two frames, so the
     parabolas of the flights before and after it are extended until they intersect. The median over
-    all bounces is returned, or about the lowest position if no two flights meet.
+    all bounces is returned. If no two flights meet, it is the 99.5 % quantile of the positions,
+    about the lowest one.
 
     Args:
         track: the tracked ball, with the times of the frames.
@@ -266,10 +268,11 @@ def _estimate_ground_position(track: BallTrack, q: Array, flights: list[_Flight]
         bounce_times = [
             t.real for t in intersection_times if abs(t.imag) < 1e-9 and begin < t.real < end
         ]
-        crossings += [float(np.polyval(earlier.curve, t)) for t in bounce_times[:1]]
+        if bounce_times:
+            crossings.append(float(np.polyval(earlier.curve, bounce_times[0])))
     if crossings:
         return float(np.median(crossings))
-    # Without two flights, use the lowest position, but ignore frames with tracking errors.
+    # A quantile instead of the maximum ignores frames with tracking errors.
     return float(np.nanpercentile(q, 99.5)) if len(track.visible_frames) else 0.0
 
 
@@ -287,6 +290,7 @@ def estimate_height_noise(times: Array, z: Array) -> float:
         Standard deviation (1 sigma) in m; NaN without a flight.
     """
     squares, degrees_of_freedom = 0.0, 0
+    # Flights are fitted to positions that count downwards.
     for flight in _fit_free_flights(times, -z):
         is_in_flight = (times >= flight.begin) & (times <= flight.end) & np.isfinite(z)
         t = times[is_in_flight] - flight.begin
@@ -308,15 +312,14 @@ def find_release_frame(track: BallTrack) -> int:
         track: Centres of the ball in the frames of a film.
     """
     fall_position, visible_frames = _compute_fall_position(track), track.visible_frames
+    # Five frames, so that an error in one of them does not matter.
     start = float(np.median(fall_position[visible_frames[:5]]))
     # Motion up to a pixel, or four standard deviations of the noise, is a trembling hand or an
     # error of the outline, not a fall.
-    moved_indices = np.flatnonzero(
-        np.abs(fall_position[visible_frames] - start) > max(1.0, 4 * track.noise)
-    )
+    is_moved = np.abs(fall_position[visible_frames] - start) > max(1.0, 4 * track.noise)
     first = int(visible_frames[0])
-    if not len(moved_indices):
+    if not is_moved.any():
         return first
-    release = int(visible_frames[moved_indices[0]])
+    release = int(visible_frames[np.argmax(is_moved)])
     hold_seconds = track.times[release] - track.times[first]
     return first if hold_seconds < _MIN_HOLD_SECONDS else release

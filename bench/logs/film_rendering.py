@@ -25,10 +25,10 @@ from sims.vision.video_files import write_video
 def write_film(
     recording: Path, out: Path, run: str | None, pixels: int, seed: int, force: bool = False
 ) -> tuple[int, float]:
-    """Film one run with a camera drawn from a seed, whose parameters are published with the film.
+    """Render a run of a recorded ball as a film, and write the film with a file of its camera.
 
-    The run's positions of the ball are read and rendered as images; they must be complete. The
-    camera and the look of the scene (colours, light) are random.
+    The positions of the ball must be complete. The camera and the look of the scene (colours,
+    light) are drawn from the seed.
 
     Args:
         recording: Path of a recording of system ball.
@@ -51,11 +51,15 @@ def write_film(
         raise InputError(f"size {pixels}: expected an even number of at least 16 pixels")
     if (system := read_system_name(recording)) != BallSystem.name:
         raise InputError(f"{recording}: expected a recording of system ball, found {system}")
+    # Without `whole`, a single run would be split into two with the same name.
     loaded_recording = read_recording(recording, BallSystem, whole=True)
     runs = {r.name: r for r in loaded_recording.runs}
-    if run is not None and run not in runs:
+    if run is None:
+        chosen_run = loaded_recording.runs[0]
+    elif run in runs:
+        chosen_run = runs[run]
+    else:
         raise make_unknown_name_error(f"run in {recording}", run, list(runs))
-    chosen_run = runs[run] if run is not None else loaded_recording.runs[0]
     if "z" not in chosen_run.channels:
         raise InputError(
             f"{recording}: expected the channel z, found {', '.join(chosen_run.channels)}"

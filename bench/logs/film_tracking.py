@@ -74,14 +74,14 @@ def track_film(
     scale: str | None = None,
     pdf: bool = False,
 ) -> TrackingResult:
-    """Track `video`; write `out`, its description, and a figure of the track in the same folder.
+    """Track the ball in a film, and write a recording of its height and a figure of the track.
 
     The ball is tracked in pixels, its path is converted to heights in metres, frames before the
-    release are left out, and the noise is estimated. Recording and figure are written together.
+    release are left out, and the noise is estimated. Either all files are written or none.
 
     Args:
         video: Path of the film.
-        out: Path NAME.csv of a new file.
+        out: Path NAME.csv of the new recording; description and figure are written next to it.
         draw: Function that draws the figure (`figures.recording_figure.render_track_figure`).
         diameter: Diameter of the ball, m.
         fps: Frames per second, instead of the file's time stamps.
@@ -93,9 +93,9 @@ def track_film(
     """
     if out.suffix != ".csv":
         raise InputError(f"{out}: expected a name that ends in .csv")
-    pictures = [out.with_suffix(ending) for ending in (".png", ".pdf")]
+    png_path, pdf_path = out.with_suffix(".png"), out.with_suffix(".pdf")
     # Check this before the work, since tracking a film takes a while.
-    check_absent([out, out.with_suffix(".toml"), *pictures[: 2 if pdf else 1]])
+    check_absent([out, out.with_suffix(".toml"), png_path, *([pdf_path] if pdf else [])])
     if diameter is not None and not LENGTH_RANGE[0] <= diameter <= LENGTH_RANGE[1]:
         expected = f"more than 0 m, from {LENGTH_RANGE[0]:g} to {LENGTH_RANGE[1]:g} m"
         raise InputError(f"ball diameter {diameter:g}: expected {expected}")
@@ -118,12 +118,10 @@ def track_film(
     noise = _estimate_height_noise(track, heights, kept_frames)
 
     # The recording and its figures are published together, so that none exists without the others.
-    figures = draw(track, heights, kept_frames, f"{video.name}: {heights.method}")
-    figure_contents = {
-        path: content
-        for path, content in zip(pictures, figures, strict=True)
-        if content is not None
-    }
+    png, pdf_content = draw(track, heights, kept_frames, f"{video.name}: {heights.method}")
+    figure_contents = {png_path: png}
+    if pdf_content is not None:
+        figure_contents[pdf_path] = pdf_content
     recording = _build_recording(track, heights, noise, kept_frames, video)
     write_recording(out, recording, BallSystem, digits=_TABLE_DIGITS, extra_files=figure_contents)
 
@@ -132,7 +130,7 @@ def track_film(
     lines = (
         f"{out}: {count} of {frames} frames with the ball, z in metres {heights.method}",
         f"noise of one sample: {track.noise:.2g} px, {1e3 * noise:.2g} mm",
-        f"{pictures[0]}: the track",
+        f"{png_path}: the track",
     )
     return TrackingResult(
         tuple(notes), frames, count, heights.method, float(track.noise), noise, lines
@@ -148,7 +146,7 @@ def _estimate_height_noise(
 
     Args:
         track: the tracked ball, with the times of the frames.
-        heights: heights of the ball, m.
+        heights: heights of the ball, m, NaN where it was not detected.
         part: frames that are recorded.
     """
     heights_of_part = heights.z[part]
@@ -172,14 +170,18 @@ def _convert_to_heights(
 ) -> ball_heights.BallHeights:
     """Convert the track of the ball from pixels to heights in metres.
 
-    The best available scale is used unless `scale` names one: a calibrated camera whose file lies
-    next to the film, the known diameter of the ball (m), or the acceleration of free fall.
+    There are three scales, the best one first: a calibrated camera whose file lies next to the
+    film, the known diameter of the ball, and the acceleration of free fall.
 
     Args:
         track: position and radius of the ball in each frame, pixels.
         video: path of the film.
         diameter: diameter of the ball in metres, if it is known.
-        scale: name of the scale to use; None for the best one available.
+        scale: "camera", "diameter" or "fall"; None for the best one available.
+
+    Raises:
+        InputError: the film does not show what the scale needs, or the scale "diameter" is
+            requested without a diameter.
     """
     camera_file = get_camera_file_path(video)
     if scale == "camera" or (scale is None and camera_file.is_file()):
@@ -198,7 +200,7 @@ def _build_recording(
         track: position and radius of the ball in each frame, pixels.
         heights: height of the ball in each frame, m.
         noise: standard deviation of z, m.
-        part: frames after the release of the ball.
+        part: frames to record, those after the release of the ball.
         video: path of the film, for the title.
     """
     pixels = {"u": track.u, "v": track.v, "radius_px": track.radius}

@@ -15,7 +15,7 @@ import numpy as np
 from sims.core.simulator import Simulator
 from sims.recording.recording import Recording, Run
 
-LARGEST_SHARE = 0.5
+MAX_SETTLING_SHARE = 0.5
 """Maximum share of a run that may be left out."""
 
 
@@ -42,22 +42,25 @@ def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Rec
     from sims.robot.dynamics.activation_filters import activation_filters, compute_settling_time
 
     runs: list[Run] = []
-    seconds = 0.0
-    longest = compute_settling_time(robot.robot, {})
+    left_out = 0.0  # longest start of a run that is left out, s
+    # Settling time if no initial activation is stated, s.
+    longest_settling = compute_settling_time(robot.robot, {})
     for run in recording.runs:
-        run = replace(run, memory=max(run.memory, longest))
+        # The commands before a part of the run are kept for as long as its filters depend on them.
+        run = replace(run, memory=max(run.memory, longest_settling))
+        # Recorded commands before the run, or stated initial activations, determine the filters.
         settling = 0.0 if run.before else compute_settling_time(robot.robot, run.initial)
         first = int(np.searchsorted(run.times, run.times[0] + settling))
-        if settling > 0 and settling <= LARGEST_SHARE * (run.times[-1] - run.times[0]):
-            seconds = max(seconds, settling)
+        if 0 < settling <= MAX_SETTLING_SHARE * (run.times[-1] - run.times[0]):
+            left_out = max(left_out, settling)
             run = run.part(slice(first, None))
         runs.append(run)
-    if not seconds:
+    if not left_out:
         return recording, ""
     filters = activation_filters(robot.robot)
     names = ", ".join(state_filter.actuator.name for state_filter in filters)
     note = (
-        f"the first {seconds:.3g} s of runs are left out, in which the filters of {names} settle: "
+        f"the first {left_out:.3g} s of runs are left out, in which the filters of {names} settle: "
         "their first activations are not recorded (state them if they are known: "
         f'[runs.NAME.initial] "{filters[0].state}" = 0.0)'
     )

@@ -45,8 +45,8 @@ class LostSamples(NamedTuple):
 def find_lost_samples(times: Array) -> LostSamples:
     """Find lost samples: where an interval is a multiple of the median interval.
 
-    An interval of about three median intervals has lost two samples. Intervals that are not close
-    to a whole multiple, within the jitter of the clock, count as they are.
+    An interval of about three median intervals has lost two samples. An interval that is not close
+    to a whole multiple, within the jitter of the clock, has lost none.
 
     Args:
         times: (T,) sample times, s; at least three.
@@ -55,15 +55,17 @@ def find_lost_samples(times: Array) -> LostSamples:
     ratios = steps / np.median(steps)
     multiples = np.maximum(np.round(ratios), 1.0)
     deviations = ratios - multiples
+    # Robust standard deviation, from the median absolute deviation.
     jitter = SIGMA_PER_MEDIAN * float(np.median(np.abs(deviations - np.median(deviations))))
     is_multiple = np.abs(deviations) < max(INTEGER_INTERVAL_TOLERANCE, 3.0 * jitter)
     return LostSamples(np.where(is_multiple, multiples - 1, 0).astype(np.intp), jitter)
 
 
 def fill_lost_commands(recording: Recording) -> tuple[Recording, str]:
-    """Insert a sample with interpolated commands and empty channels where a row was lost.
+    """Insert a sample with interpolated commands and missing readings where a row was lost.
 
-    Runs without inputs, or with uneven sampling intervals, and longer gaps stay as they are.
+    Runs without inputs, or with uneven sampling intervals, and gaps of more than
+    `MAX_FILLED_SAMPLES` samples stay as they are.
 
     Returns:
         The recording, and a message for the user, which is empty if nothing was lost.
@@ -72,10 +74,10 @@ def fill_lost_commands(recording: Recording) -> tuple[Recording, str]:
     for run in recording.runs:
         if run.inputs and run.times.size > 2:
             lost = find_lost_samples(run.times)
-            filled = np.where(lost.counts <= MAX_FILLED_SAMPLES, lost.counts, 0)
-            if lost.jitter <= MAX_FILLED_JITTER and filled.sum() > 0:
-                count += int(filled.sum())
-                run = _insert_samples(run, filled)
+            fill_counts = np.where(lost.counts <= MAX_FILLED_SAMPLES, lost.counts, 0)
+            if lost.jitter <= MAX_FILLED_JITTER and fill_counts.sum() > 0:
+                count += int(fill_counts.sum())
+                run = _insert_samples(run, fill_counts)
         runs.append(run)
     if not count:
         return recording, ""
@@ -87,18 +89,21 @@ def fill_lost_commands(recording: Recording) -> tuple[Recording, str]:
 
 
 def _insert_samples(run: Run, counts: NDArray[np.intp]) -> Run:
-    """Insert evenly spaced samples into a run, with interpolated inputs and without readings.
+    """Insert evenly spaced samples into a run, with interpolated inputs and missing readings.
+
+    Extra columns and the masks of drives that are off keep the value of the sample before.
 
     Args:
         run: the run.
         counts: (T - 1,) number of samples to insert into each interval.
     """
-    # For each inserted sample, the index of the sample before its interval.
-    first = np.repeat(np.arange(counts.size), counts)
-    inserted_before = np.cumsum(counts) - counts
-    fractions = (np.arange(first.size) - inserted_before[first] + 1.0) / (counts[first] + 1.0)
-    times = run.times[first] + fractions * np.diff(run.times)[first]
-    indices = first + 1
+    # For each inserted sample, the index of the interval, and of the sample before it.
+    intervals = np.repeat(np.arange(counts.size), counts)
+    # Number of the inserted sample in its interval, from 1.
+    numbers = np.arange(intervals.size) - (np.cumsum(counts) - counts)[intervals] + 1.0
+    fractions = numbers / (counts[intervals] + 1.0)
+    times = run.times[intervals] + fractions * np.diff(run.times)[intervals]
+    indices = intervals + 1
 
     def interpolate(values: Array) -> Any:
         """Return a local cubic interpolation, which does not overshoot where commands jump."""
@@ -116,6 +121,6 @@ def _insert_samples(run: Run, counts: NDArray[np.intp]) -> Run:
         times=np.insert(run.times, indices, times),
         channels=insert(run.channels, lambda _: np.nan),
         inputs=insert(run.inputs, lambda old: interpolate(old)(times)),
-        extra=insert(run.extra, lambda old: old[first]),
-        off=insert(run.off, lambda old: old[first]),
+        extra=insert(run.extra, lambda old: old[intervals]),
+        off=insert(run.off, lambda old: old[intervals]),
     )

@@ -18,17 +18,21 @@ _INCLUDE = re.compile(rb"<include\s+file\s*=\s*[\"']([^\"']+)[\"']")
 
 
 def compute_recording_digest(path: Path, further_text: str = "") -> str:
-    """Hash a recording: its table, its description, the mapped logs and bags, and its model.
+    """Hash a recording: its table, its description, all logs that it refers to, and its model.
 
     Args:
         path: Path of its table or description.
         further_text: Further text that is part of the hash.
+
+    Returns:
+        SHA-256, hexadecimal.
 
     Raises:
         InputError: The table or the description cannot be read.
     """
     digest = hashlib.sha256(further_text.encode())
     description = get_description_path(path)
+    # `path` may be the description itself, which is then hashed once.
     for file in dict.fromkeys([path, description]):
         try:
             digest.update(file.read_bytes())
@@ -40,11 +44,17 @@ def compute_recording_digest(path: Path, further_text: str = "") -> str:
 
 
 def compute_content_digest(path: Path) -> bytes:
-    """Return a hash of the content of a file, a model file with its includes, a bag or an episode.
+    """Return a hash of the content of a log or model file.
 
-    The hash tells whether a recording has changed since it was explained. A bag is a folder or file
-    of ROS, hashed as a whole; an episode of a LeRobot dataset consists of several files. Missing
-    files contribute nothing; reading them later reports the error.
+    The path names one of these:
+
+    * an episode of a LeRobot dataset, which consists of several files; the result is the hashes of
+      all of them, one after another
+    * a topic of a ROS bag, or a group of an HDF5 file; the whole bag or file is hashed
+    * a model file (.xml), hashed with the files that it includes
+    * any other file
+
+    Missing files contribute nothing; reading them later reports the error.
     """
     episode = split_episode_path(path)
     if episode is not None:
@@ -52,21 +62,26 @@ def compute_content_digest(path: Path) -> bytes:
             return b"".join(compute_content_digest(file) for file in list_episode_files(*episode))
         except InputError:
             return b""
-    bag = split_bag_path(path) or split_group_path(path)
-    root = path if bag is None else bag[0]
-    files = sorted(root.rglob("*")) if bag is not None and root.is_dir() else [root]
-    content = hashlib.sha256()
-    for file in files if root.suffix.lower() != ".xml" else _list_included_files(root):
+    container = split_bag_path(path) or split_group_path(path)
+    root = path if container is None else container[0]
+    if root.suffix.lower() == ".xml":
+        files = _list_included_files(root)
+    elif container is not None and root.is_dir():  # a bag of ROS 2
+        files = sorted(root.rglob("*"))
+    else:
+        files = [root]
+    digest = hashlib.sha256()
+    for file in files:
         if file.is_file():
             file_stat = file.stat()
-            content.update(hash_file(file, file_stat.st_mtime_ns, file_stat.st_size))
-    return content.digest()
+            digest.update(hash_file(file, file_stat.st_mtime_ns, file_stat.st_size))
+    return digest.digest()
 
 
 def _list_included_files(model: Path) -> list[Path]:
     """Return a model file and the files that it includes, directly or through others.
 
-    They are searched in the folder of the model.
+    As in MJCF, all names are relative to the folder of the model file.
     """
     files = [model]
     # Files that are appended here are visited later in this loop.

@@ -25,21 +25,19 @@ def load_joined(
 ) -> tuple[Recording, type[Simulator]]:
     """Read several recordings, join them into one, and find their simulator.
 
-    Each recording is read and, unless the runs are few, divided into runs for fitting and held-out
-    runs on its own. Then the runs are renamed, as several logs may have the same run names, and
-    put together.
-
-    Two or three unmarked runs in total are cross-validated; otherwise each recording holds out the
-    runs that it would hold out alone, at least one. A constant that the recordings state
-    differently becomes a constant of the runs; a noise that they state differently is replaced by
-    its root mean square.
+    * Runs get the name of their log in front, since several logs may have the same run names.
+    * Up to `MAX_FOLDS` runs in total, none of them marked as held out, are cross-validated.
+      Otherwise each recording holds out the runs that it would hold out alone, at least one.
+    * A constant that the recordings state differently becomes a constant of the runs.
+    * The noise of a channel is the root mean square of the stated noises; it is unknown if some
+      recording states none.
 
     Args:
         sources: Paths of the tables, or recordings in memory.
         system: Registered system to use instead of the one that the recordings name.
         model: Model file of a robot to use instead of the one that the recordings name.
         free: Numbers of a robot's model file to tune; empty for those of the description.
-        prepared: Function applied to each recording before its runs are divided.
+        prepared: Function applied to each recording before its runs are divided; None for none.
         fix_base: Whether to fix floating bodies of a robot in the pose of its model file.
 
     Returns:
@@ -58,14 +56,24 @@ def load_joined(
     if len(loaded) == 1:
         return split_held_out(first_recording, folds=True), kind
     for recording, other_kind in loaded[1:]:
-        _refuse_other(first_recording, kind, recording, other_kind)
+        _check_joinable(first_recording, kind, recording, other_kind)
     recordings = [recording for recording, _ in loaded]
-    runs_of_all = [run for recording in recordings for run in recording.runs]
-    is_cross_validated = len(runs_of_all) <= MAX_FOLDS and not any(
-        run.held_out for run in runs_of_all
-    )
-    if not is_cross_validated:
-        recordings = [split_held_out(recording) for recording in recordings]
+    all_runs = [run for recording in recordings for run in recording.runs]
+    is_cross_validated = len(all_runs) <= MAX_FOLDS and not any(run.held_out for run in all_runs)
+    if is_cross_validated:
+        # The joined recording is divided into folds.
+        return split_held_out(_join_recordings(recordings, kind), folds=True), kind
+    return _join_recordings(list(map(split_held_out, recordings)), kind), kind
+
+
+def _join_recordings(recordings: Sequence[Recording], kind: type[Simulator]) -> Recording:
+    """Join recordings that `_check_joinable` accepts; see `load_joined`.
+
+    Args:
+        recordings: recordings of one system with the same channels and inputs.
+        kind: simulator class of their system, which declares the constants.
+    """
+    first_recording = recordings[0]
     names = make_log_names([recording.path for recording in recordings])
     common_constants = {
         key: value
@@ -75,6 +83,7 @@ def load_joined(
     default_values = {c.name: c.value for c in kind.constants}
     stated_keys = {key for recording in recordings for key in recording.constants}
     differing = stated_keys - common_constants.keys()
+    # A constant of a run is, in this order: its own, that of its recording, or the default.
     runs = [
         replace(
             run,
@@ -89,12 +98,11 @@ def load_joined(
         for name, recording in zip(names, recordings, strict=True)
         for run in recording.runs
     ]
-    joined_recording = replace(
+    return replace(
         first_recording,
         title=f"{first_recording.title or first_recording.path.stem} and "
-        + format_count(len(loaded) - 1, "more log"),
+        + format_count(len(recordings) - 1, "more log"),
         constants=common_constants,
-        # The noise of a channel for which some recording states none is not known.
         noise={
             name: compute_rms([recording.noise[name] for recording in recordings])
             for name in first_recording.noise
@@ -103,29 +111,32 @@ def load_joined(
         runs=tuple(runs),
         notes=tuple(note for recording in recordings for note in recording.notes),
     )
-    if is_cross_validated:
-        joined_recording = split_held_out(joined_recording, folds=True)
-    return joined_recording, kind
 
 
-def _refuse_other(
+def _check_joinable(
     first: Recording, kind: type[Simulator], other: Recording, other_kind: type[Simulator]
 ) -> None:
-    """Reject a recording that cannot be joined with the first one.
+    """Check that a recording can be joined with the first one.
 
     Both must be of one system (robots: one model file) and have the same channels and inputs, since
     the joined recording is fitted with one simulator.
 
+    Args:
+        first: first recording.
+        kind: simulator class of its system.
+        other: another recording.
+        other_kind: simulator class of the system of the other recording.
+
     Raises:
         InputError: System, model file, channels or inputs of the recordings differ.
     """
-    robots = kind.has_model and other_kind.has_model
-    if (kind.has_model or other_kind.has_model) != robots or other_kind.name != kind.name:
+    if kind.has_model != other_kind.has_model or other_kind.name != kind.name:
         raise InputError(
             f"{other.path}: expected a log of {kind.name} as {first.path}, found one of "
             f"{other_kind.name}; explain it by itself"
         )
-    if robots and vars(other_kind)["source_digest"] != vars(kind)["source_digest"]:
+    # The digest of a robot covers its model file, added actuators and free numbers.
+    if kind.has_model and vars(other_kind)["source_digest"] != vars(kind)["source_digest"]:
         raise InputError(
             f"{other.path}: expected the model file, the actuators and the free numbers of "
             f"{first.path}, found others; state the same, or give --model and --free"
@@ -144,7 +155,11 @@ def _refuse_other(
 
 
 def make_log_names(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each log: its stem, with its folder if stems repeat."""
+    """Return a different name for each log.
+
+    It is the stem of its path; with its folder if stems repeat, and with its number if these
+    repeat, too.
+    """
     stems = [path.stem for path in paths]
     if len(set(stems)) == len(stems):
         return stems

@@ -37,7 +37,7 @@ def load_recording(
     divide: bool = True,
     fix_base: bool = False,
 ) -> tuple[Recording, type[Simulator]]:
-    """Read a recording and find its simulator; its runs are divided for fitting and validation.
+    """Read a recording, find its simulator, and divide its runs for fitting and validation.
 
     Args:
         source: Path of the table, or a recording in memory.
@@ -58,6 +58,7 @@ def load_recording(
     if isinstance(source, Recording):
         recording = source
     else:
+        # `whole` holds out marked runs only; unmarked ones are divided below.
         recording = read_recording(Path(source), kind, whole=True)
     if divide:
         recording = split_held_out(recording, folds=True)
@@ -83,12 +84,16 @@ def get_simulator_class(
         model: Model file of a robot to use instead of the one that the recording names.
         free: Numbers of a robot's model file to tune; empty for those of the description.
         fix_base: Whether to fix floating bodies of a robot in the pose of its model file.
+
+    Raises:
+        InputError: Both a system and a model file are given or stated, or the system is unknown.
     """
     if system is not None and model is not None:
         raise InputError("expected a system or a model file, found both; leave one out")
     if isinstance(source, Recording):
         path, reference = source.path, source.model
         if model is not None:
+            # The other settings of a robot that the recording states still hold.
             reference = replace(reference or ModelFileReference(Path(), {}, {}), path=Path(model))
     else:
         path = Path(source)
@@ -111,10 +116,10 @@ def _find_system(path: str | Path, name: str) -> type[Simulator]:
 
 
 def check_value_sizes(recording: Recording) -> None:
-    """Reject values that are so large that sums of their squares, as in an error, may overflow.
+    """Reject values that are so large that sums of their squares may overflow.
 
     Raises:
-        InputError: There is such a value; the message is one line.
+        InputError: A value of a channel or input exceeds `MAX_NUMBER`; the message is one line.
     """
     for run in recording.runs:
         for name, values in (*run.channels.items(), *run.inputs.items()):
@@ -167,8 +172,8 @@ def read_frame_recording(
 ) -> Recording:
     """Read the recording in a data frame; only runs that are marked so are held out.
 
-    The data frame replaces a table, and `frame_description` the description file next to it. What
-    is given by name (system, model, constants) precedes the entries of its description.
+    The data frame replaces a CSV table, and `frame_description` the TOML file that describes it.
+    What it gives by name (system, model, constants) precedes the entries of its `description`.
 
     Args:
         frame: Columns ``run`` (if there are several), ``t`` and one for each channel and input.
@@ -179,6 +184,7 @@ def read_frame_recording(
         InputError: The data frame or its description is malformed; the message is one line.
     """
     meta = dict(frame_description.description or {})
+    # A description states a system or a model file: the one that is given replaces the other.
     if frame_description.system is not None:
         meta.pop("model", None)
         meta["system"] = frame_description.system

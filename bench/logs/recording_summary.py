@@ -77,25 +77,24 @@ def compute_run_statistics(run: Run) -> RunStatistics:
     """Count samples, gaps and missing values of a run, and measure its duration and intervals."""
     intervals = np.diff(run.times)
     median = float(np.median(intervals))
-    missing = sum(int(np.isnan(v).sum()) for v in run.channels.values())
     return RunStatistics(
-        run.name,
-        run.held_out,
-        int(run.times.size),
-        float(run.times[-1] - run.times[0]),
-        1.0 / median,
-        float(intervals.min()),
-        median,
-        float(intervals.max()),
-        count_gaps(run.times),
-        missing,
+        name=run.name,
+        held_out=run.held_out,
+        samples=int(run.times.size),
+        seconds=float(run.times[-1] - run.times[0]),
+        rate=1.0 / median,
+        shortest=float(intervals.min()),
+        median=median,
+        longest=float(intervals.max()),
+        gaps=count_gaps(run.times),
+        missing=sum(int(np.isnan(values).sum()) for values in run.channels.values()),
     )
 
 
 def compute_signal_statistics(
     recording: Recording, channel: Channel, kind: str
 ) -> SignalStatistics:
-    """Compute the statistics of a signal over all runs.
+    """Compute range, missing share and noise of a signal over all runs.
 
     Args:
         recording: Recording with the signal.
@@ -103,19 +102,19 @@ def compute_signal_statistics(
         kind: input or channel.
     """
     signals = [(run.times, {**run.inputs, **run.channels}[channel.name]) for run in recording.runs]
-    values = np.concatenate([v for _, v in signals])
+    values = np.concatenate([run_values for _, run_values in signals])
     # An input is what was commanded, so it has no noise.
     noise = estimate_noise(signals) if kind == "channel" else NoiseEstimate(np.nan, 0.0)
     return SignalStatistics(
-        channel.name,
-        kind,
-        channel.unit,
-        float(np.nanmin(values)),
-        float(np.nanmax(values)),
-        float(np.isnan(values).mean()),
-        recording.noise.get(channel.name),
-        noise.sigma,
-        noise.step,
+        name=channel.name,
+        kind=kind,
+        unit=channel.unit,
+        low=float(np.nanmin(values)),
+        high=float(np.nanmax(values)),
+        missing=float(np.isnan(values).mean()),
+        stated=recording.noise.get(channel.name),
+        estimated=noise.sigma,
+        step=noise.step,
     )
 
 
@@ -133,6 +132,9 @@ def list_recorded_signals(recording: Recording, kind: type[Simulator]) -> list[t
 
 def to_document(recording: Recording, kind: type[Simulator]) -> dict[str, Any]:
     """Build the JSON document with the statistics of a recording.
+
+    Of each constant it has the value that holds for all runs, whether the description states it or
+    it is the default of the system, and the runs with a value of their own.
 
     Args:
         recording: Recording to summarise.
@@ -198,13 +200,13 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
     seconds = sum(run.times[-1] - run.times[0] for run in runs)
     held_out = len(recording.held_out())
     yield recording.title
-    # A single run is divided into two parts with the same name.
     run_count = len({run.name for run in runs})
-    held_out_text = f"{held_out} held out"
-    if run_count < len(runs):
-        held_out_text = "its last third is held out"
-    if recording.folds():
+    if recording.folds():  # cross-validation
         held_out_text = "each left out in turn"
+    elif run_count < len(runs):  # a single run, divided into two parts with the same name
+        held_out_text = "its last third is held out"
+    else:
+        held_out_text = f"{held_out} held out"
     size = f"{format_count(run_count, 'run')} ({held_out_text}), {samples} samples, {seconds:.4g} s"
     yield f"{recording.path}: system {recording.system}, {size}"
     yield from recording.notes
@@ -222,10 +224,15 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
 def _run_row(run: Run) -> tuple[str, ...]:
     """Format the statistics of a run as a table row; sampling intervals are in milliseconds."""
     statistics = compute_run_statistics(run)
-    use = "held out" if run.held_out else "fitting"
+    if run.fold is not None:  # cross-validation
+        use = "left out in turn"
+    elif run.held_out:
+        use = "held out"
+    else:
+        use = "fitting"
     return (
         statistics.name,
-        use if run.fold is None else "left out in turn",
+        use,
         str(statistics.samples),
         f"{statistics.seconds:.4g}",
         f"{statistics.rate:.4g}",
@@ -236,10 +243,11 @@ def _run_row(run: Run) -> tuple[str, ...]:
 
 
 def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[str, ...]]:
-    """Yield a row of the table of signals for each channel and input: unit, range, gaps and noise.
+    """Yield a row of the table of signals for each channel and input.
 
-    The stated noise is "-" for a channel whose noise is not stated, and empty for an input, which
-    has none; steps are quantisation steps.
+    It has the unit, the range, the share of missing samples, and the noise as the description
+    states it and as it is estimated. The stated noise is "-" for a channel whose noise is not
+    stated, and empty for an input, which has none; steps are quantisation steps.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -247,7 +255,7 @@ def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterato
     """
     for channel, role in list_recorded_signals(recording, kind):
         statistics = compute_signal_statistics(recording, channel, role)
-        not_stated = "-" if role == "channel" else ""
+        unknown_noise = "-" if role == "channel" else ""
         yield (
             statistics.name,
             role,
@@ -255,7 +263,7 @@ def _iterate_signal_rows(recording: Recording, kind: type[Simulator]) -> Iterato
             f"{statistics.low:.4g}",
             f"{statistics.high:.4g}",
             f"{statistics.missing:.1%}" if statistics.missing else "0",
-            not_stated if statistics.stated is None else f"{statistics.stated:.3g}",
+            unknown_noise if statistics.stated is None else f"{statistics.stated:.3g}",
             f"{statistics.estimated:.3g}" if np.isfinite(statistics.estimated) else "",
             f"in steps of {statistics.step:.3g}" if statistics.step else "",
         )
@@ -280,7 +288,7 @@ def _format_constants(recording: Recording, kind: type[Simulator]) -> Iterator[s
 
 
 def _format_constant(recording: Recording, name: str, default: float, unit: str) -> str:
-    """Describe a constant's value, and list the runs with each value if it differs.
+    """Format a constant's value in one line, and list the runs with each value if it differs.
 
     A run may state its own value; the value of the recording, or else the default, holds for the
     other runs.
@@ -331,7 +339,9 @@ def format_robot_summary(kind: type[Simulator]) -> Iterator[str]:
 
 
 def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
-    """Yield lines about a robot's signals missing in the log and signals beyond their limits.
+    """Yield warnings about a robot's signals: those missing in the log, and those beyond limits.
+
+    Other systems have none.
 
     Args:
         recording: Recording to check.
@@ -345,7 +355,7 @@ def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator
 
 
 def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[str]:
-    """Yield a line for the commands and one for the joint positions missing in the log.
+    """Yield a line that names the missing commands, and one for the missing joint positions.
 
     Args:
         recording: the recording, of which the first run counts.
@@ -356,9 +366,9 @@ def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[s
     if missing_commands:
         yield f"not in the log, assumed to be zero: {', '.join(missing_commands)}"
     joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
-    unseen = [name for name in joints if f"q.{name}" not in run.channels]
-    if unseen:
-        joint_names = ", ".join(unseen)
+    missing_joints = [name for name in joints if f"q.{name}" not in run.channels]
+    if missing_joints:
+        joint_names = ", ".join(missing_joints)
         yield (
             "positions that are not in the log, with initial values from the model file: "
             f"{joint_names}"

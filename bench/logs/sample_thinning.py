@@ -34,7 +34,8 @@ MIN_RUN_SAMPLES = 40
 def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
     """Keep each k-th sample of a robot's recording if these samples contain all motion.
 
-    Inputs with zero-order hold are averaged between the samples that are kept.
+    The largest such k is taken with which the sampling rate stays above `MIN_THINNED_RATE`. Inputs
+    with zero-order hold are averaged between the samples that are kept.
 
     Args:
         recording: Recording as it was read.
@@ -43,6 +44,7 @@ def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recordi
     Returns:
         The recording, and a message for the user, which is empty if it is unchanged.
     """
+    # Sampling rate of the slowest run, Hz; a run of one sample has none.
     rate = min(
         (
             float(1.0 / np.median(np.diff(run.times))) if run.times.size > 1 else 0.0
@@ -52,15 +54,9 @@ def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recordi
     )
     if not kind.has_model or rate <= MAX_UNCHANGED_RATE:
         return recording, ""
-    stride = next(
-        (
-            k
-            for k in range(round(rate / MIN_THINNED_RATE), 1, -1)
-            if _preserves_motion(recording, k)
-        ),
-        1,
-    )
-    if stride == 1:
+    strides = range(round(rate / MIN_THINNED_RATE), 1, -1)
+    stride = next((k for k in strides if _preserves_motion(recording, k)), None)
+    if stride is None:
         return recording, ""
     runs = tuple(_thin_run(run, stride) for run in recording.runs)
     note = (
@@ -71,10 +67,12 @@ def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recordi
 
 
 def _preserves_motion(recording: Recording, stride: int) -> bool:
-    """Return whether every k-th sample still shows the whole motion.
+    """Return whether every k-th sample still shows the whole motion of each channel in each run.
 
-    The motion between the kept samples is interpolated by a spline. If every second sample is kept,
-    the error of this is only noise. With every k-th one it may hardly be larger.
+    The samples between the kept ones are predicted by a spline. If every second sample is kept, the
+    error of the prediction is only noise. With every k-th one it may be hardly larger, or else
+    negligible compared with the range of the channel. Short runs and channels with many missing
+    samples count as not preserved.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -110,6 +108,7 @@ def _compute_interpolation_error(times: Array, values: Array, stride: int) -> fl
     is_node = is_recorded & (np.arange(times.size) % stride == 0)
     first, last = np.flatnonzero(is_node)[[0, -1]]
     is_left_out = is_recorded & ~is_node
+    # The spline is not extrapolated.
     is_left_out[:first] = is_left_out[last:] = False
     if not is_left_out.any():
         return 0.0
@@ -127,11 +126,13 @@ def _thin_run(run: Run, stride: int) -> Run:
         stride: the number k.
     """
     thinned_run = run.part(slice(None, None, stride))
-    first = np.arange(0, run.times.size, stride)
-    spans = np.diff(run.times, append=run.times[-1] + np.median(np.diff(run.times)))
+    kept_indices = np.arange(0, run.times.size, stride)
+    # Seconds for which each sample of an input holds; the last one for a usual interval.
+    durations = np.diff(run.times, append=run.times[-1] + np.median(np.diff(run.times)))
     inputs = dict(thinned_run.inputs)
     for name in thinned_run.inputs:
         if name not in run.linear:
-            weighted_sums = np.add.reduceat(run.inputs[name] * spans, first)
-            inputs[name] = weighted_sums / np.add.reduceat(spans, first)
+            # Mean over time from each kept sample to the next.
+            integrals = np.add.reduceat(run.inputs[name] * durations, kept_indices)
+            inputs[name] = integrals / np.add.reduceat(durations, kept_indices)
     return replace(thinned_run, inputs=inputs)

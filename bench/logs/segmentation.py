@@ -55,17 +55,18 @@ def segment_recording(
 ) -> SegmentedRecording:
     """Cut the runs of a recording into segments if it is too long or if the user requests it.
 
-    Runs for fitting are reduced to segments that together cost `MAX_RECORDING_COST`, and so are
-    held-out runs; at least one segment of each run is kept. A run keeps the same share of its
-    duration as every other run. Of robots with floating bodies only the beginnings of runs are
-    used, because the pose of the body is known there only.
+    The runs for fitting are reduced to segments that together cost `MAX_RECORDING_COST` to
+    simulate, and so are the held-out runs. All of these runs are reduced by the same factor, but at
+    least one segment of each is kept. Of robots with floating bodies only the beginnings of runs
+    are used, because the pose of the body is known there only.
 
     Args:
         recording: Recording as it was read.
         kind: Simulator class of its system; without a model file it is cut only on request.
         seconds: Duration of a segment if every run is to be cut; None to cut long recordings only,
             into segments of `SEGMENT_SECONDS` seconds.
-        whole: Whether to keep all segments, and to leave the recording whole if `seconds` is None.
+        whole: Whether to allow any cost: all segments are kept, or the recording is left whole if
+            `seconds` is None.
 
     Returns:
         The recording, with a message for the user.
@@ -76,8 +77,8 @@ def segment_recording(
     if seconds is None and (whole or not kind.has_model):
         return SegmentedRecording(recording, "")
     robot: Any = kind
-    floats = kind.has_model and bool(robot.system.floating_state_units)
-    if floats and seconds is not None:
+    is_floating = kind.has_model and bool(robot.system.floating_state_units)
+    if is_floating and seconds is not None:
         raise InputError(
             f"{recording.path}: expected no --pieces: {recording.system} has a floating base, "
             "whose pose at the start of a piece is not known; leave it out"
@@ -86,13 +87,13 @@ def segment_recording(
     affordable_seconds = _compute_affordable_seconds(kind) if is_limited else np.inf
     segments: list[Run] = []
     notes = []
-    for word, runs in (("fitting", recording.training()), ("measuring", recording.held_out())):
+    for purpose, runs in (("fitting", recording.training()), ("measuring", recording.held_out())):
         total_seconds = sum(map(_compute_duration, runs))
         if total_seconds <= affordable_seconds and seconds is None:
             segments += runs
             continue
         share = min(affordable_seconds / total_seconds, 1.0) if total_seconds > 0 else 1.0
-        cut_run = _take_beginning if floats else _cut_run
+        cut_run = _take_beginning if is_floating else _cut_run
         new_segments = [
             segment
             for run in runs
@@ -101,7 +102,7 @@ def segment_recording(
         segments += new_segments
         used_seconds = sum(map(_compute_duration, new_segments))
         notes.append(
-            f"{used_seconds:.3g} s of {total_seconds:.4g} s for {word}, "
+            f"{used_seconds:.3g} s of {total_seconds:.4g} s for {purpose}, "
             f"in {len(new_segments)} pieces"
         )
     if not notes:
@@ -128,11 +129,16 @@ def _compute_duration(run: Run) -> float:
 
 
 def _cut_run(run: Run, seconds: float, max_length: float) -> list[Run]:
-    """Cut a run into segments of at most `max_length` seconds that last about `seconds` in total.
+    """Cut segments out of a run that last about `seconds` in total.
 
     The run is divided into equal parts, one for each segment. Within its part, a segment begins at
     the sample before which the commands have changed least: the unknown motion before it then
-    matters least.
+    matters least. The samples between the segments are not used.
+
+    Args:
+        run: run to cut.
+        seconds: total duration of the segments.
+        max_length: longest duration of a segment, s.
     """
     length = min(max_length, seconds)
     # A segment needs a few samples, even if only little of a run may be kept.
@@ -163,7 +169,10 @@ def _take_beginning(run: Run, seconds: float, _: float) -> list[Run]:
     Args:
         run: recorded run: times, channels and inputs.
         seconds: length of the beginning.
-        _: unused.
+        _: unused, for the signature of `_cut_run`.
+
+    Returns:
+        One segment of at least `MIN_SEGMENT_INTERVALS` samples.
     """
     end = int(np.searchsorted(run.times, run.times[0] + seconds - ROUNDING_SECONDS))
     return [
@@ -174,21 +183,22 @@ def _take_beginning(run: Run, seconds: float, _: float) -> list[Run]:
 
 
 def _compute_command_changes(run: Run) -> Array:
-    """Return (T,) the change of the commands before each sample, relative to their range.
+    """Return (T,) how much the commands change before each sample.
 
-    It sums the absolute changes of all commands within the last `QUIET_LEAD_SECONDS`; 0 means that
-    the commands were constant.
+    It is the sum of the absolute changes within the last `QUIET_LEAD_SECONDS`, each divided by the
+    range of its command, over all commands; 0 means that the commands were constant.
 
     Args:
         run: Run with its inputs.
     """
-    lead_places = np.searchsorted(run.times, run.times - QUIET_LEAD_SECONDS)
+    # Index of the sample at which the time considered begins.
+    lead_starts = np.searchsorted(run.times, run.times - QUIET_LEAD_SECONDS)
     total = np.zeros(run.times.size)
     for values in run.inputs.values():
         spread = float(np.ptp(values))
         if spread > 0:
             cumulative_change = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(values)))]) / spread
-            total += cumulative_change - cumulative_change[lead_places]
+            total += cumulative_change - cumulative_change[lead_starts]
     return total
 
 
@@ -196,20 +206,20 @@ MIN_PART_SAMPLES = 10
 """Minimum number of samples of a part of a run; fewer determine no more than an initial state."""
 
 
-def split_without_masked(run: Run, off: Mask) -> list[Run]:
-    """Return the parts of a run in which a mask is not set.
+def split_without_masked(run: Run, mask: Mask) -> list[Run]:
+    """Cut the samples that a mask marks out of a run, and return the remaining parts.
 
-    Parts of fewer than `MIN_PART_SAMPLES` samples are left out. If the mask is set nowhere, the run
-    itself is returned.
+    Parts of fewer than `MIN_PART_SAMPLES` samples, or without any measurement, are left out. If the
+    mask is set nowhere, the run itself is returned.
 
     Args:
         run: recorded run: times, channels and inputs.
-        off: (T,) the mask.
+        mask: (T,) whether a sample is cut out.
     """
-    if not off.any():
+    if not mask.any():
         return [run]
     split_runs = []
-    for first, end in spans(~off):
+    for first, end in spans(~mask):
         if end - first < MIN_PART_SAMPLES:
             continue
         name = f"{run.name} from {run.times[first]:.4g} s" if first else run.name

@@ -203,7 +203,8 @@ class _RecordingSimulation:
             {} if options.parameters is None else options.parameters, kind
         )
         self.effects = {
-            name: _make_coefficients(name, c, kind) for name, c in (options.effects or {}).items()
+            name: _make_coefficients(name, coefficients, kind)
+            for name, coefficients in (options.effects or {}).items()
         }
         self.engine = options.engine
         if not self.engine and issubclass(kind, SystemSimulator) and not kind.own_engine:
@@ -216,6 +217,7 @@ class _RecordingSimulation:
         self.ranges = {**self.defaults.initial, **stated_ranges}
         check_known_names("input", inputs, [c.name for c in kind.inputs])
         inputs = {**self.defaults.inputs, **inputs}
+        # A constant input is stored as the text of a signal, with all digits of its number.
         self.inputs = {
             name: value if isinstance(value, str) else f"{_check_number('input', name, value):.17g}"
             for name, value in inputs.items()
@@ -241,16 +243,13 @@ class _RecordingSimulation:
         stated_noise = {name: sigma for name, sigma in self.noise.items() if sigma}
         constants, system = self.simulator.constant_values, self.name
         path = Path(f"{system}-simulated.csv")  # Used in messages only; there is no such file.
-        model = self.options.model and ModelFileReference(
-            Path(self.options.model), self.options.actuators or {}, {}
-        )
+        model_path = Path(self.options.model) if self.options.model else None
+        model = model_path and ModelFileReference(model_path, self.options.actuators or {}, {})
         title = f"{system}, simulated"
-        recording = Recording(
-            path, system, title, constants, stated_noise, runs, model=model or None
-        )
+        recording = Recording(path, system, title, constants, stated_noise, runs, model=model)
         truth = {
             "system": system,
-            **({"model": str(Path(self.options.model).resolve())} if self.options.model else {}),
+            **({"model": str(model_path.resolve())} if model_path else {}),
             "engine": self.engine or "its own",
             "seed": self.options.seed,
             "parameters": self.theta,
@@ -276,9 +275,10 @@ class _RecordingSimulation:
         return self.kind(values, observe)
 
     def _build_scenario(self, number: int) -> Scenario:
-        """Build the scenario of run `number`.
+        """Build the scenario of run `number`: its initial states and inputs.
 
-        Each random draw has its own stream, so that no draw depends on any other.
+        An initial state is drawn from its interval; equal ends fix it. Each random draw has its own
+        stream, so that no draw depends on any other.
         """
         initial = {
             name: low if low == high else self._make_rng("initial", name, number).uniform(low, high)
@@ -300,6 +300,7 @@ class _RecordingSimulation:
             number: number of the run from 1; the last ones are held out for validation.
             scenario: times, inputs and initial states of the run.
         """
+        # (T, C): the simulator takes a batch of parameter vectors, here of one.
         observed = self.simulator.simulate(np.array([list(self.theta.values())]), scenario)[0]
         if not np.isfinite(observed).all():
             raise InputError(
@@ -336,9 +337,11 @@ def _get_simulator_class(options: SimulationSpec) -> type[Simulator]:
 
 
 def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
-    """Return the default recording of a simulator's system.
+    """Return the default initial states, inputs and observed channels of a simulator's system.
 
-    An extended simulator records the channels of the recording that it was fitted to.
+    For an extended simulator, which has another name than its system, the default channels are left
+    out, because it records the channels of the recording that it was fitted to. A simulator without
+    a system has no defaults.
     """
     if not issubclass(kind, SystemSimulator):
         return DefaultRecording()
@@ -426,12 +429,10 @@ def _make_coefficients(
         kind: class of the simulator.
     """
     if isinstance(stated_values, Mapping):
-        coefficients = (
-            library.find_effect(name, kind.system).on(kind.system)
-            if issubclass(kind, SystemSimulator)
-            else ()
-        )
-        names = [c.name for c in coefficients]
+        names = []
+        if issubclass(kind, SystemSimulator):
+            coefficients = library.find_effect(name, kind.system).on(kind.system)
+            names = [coefficient.name for coefficient in coefficients]
         check_known_names(f"coefficient of effect {name}", stated_values, names)
         return [_check_number(f"effect {name}:", c, stated_values.get(c, 0.0)) for c in names]
     values = [stated_values] if isinstance(stated_values, int | float) else list(stated_values)
@@ -441,10 +442,11 @@ def _make_coefficients(
 
 
 def _repeat_for_places(name: str, values: list[float], kind: type[Simulator]) -> list[float]:
-    """Repeat the coefficients of one place for all places of an effect family.
+    """Repeat the coefficients of one place of a robot for all places of an effect family.
 
-    A family, such as a drag at each joint, has a member for each place. Values that are not the
-    coefficients of exactly one member are returned unchanged.
+    A family, such as a drag at each joint, has a member for each place (joint, body or actuator) at
+    which the effect acts. Values that are not the coefficients of exactly one member are returned
+    unchanged.
 
     Args:
         name: name of the effect; that of a family ends with ``@*``.
@@ -465,8 +467,13 @@ def _make_noise_table(
 ) -> dict[str, float]:
     """Return the standard deviation of the noise of each channel, in the channel's unit.
 
-    `stated` is one value for all channels, or a value for each. Channels that are not named have
-    none.
+    Args:
+        stated: one value for all channels, or values by channel; the name ``*`` stands for all
+            channels that are not named, which otherwise have no noise.
+        channels: names of the recorded channels.
+
+    Raises:
+        InputError: a channel is unknown, or a value is negative or not a number.
     """
     stated_by_name = stated if isinstance(stated, Mapping) else {ALL_CHANNELS: stated}
     check_known_names(

@@ -107,20 +107,29 @@ class LogColumn(NamedTuple):
 
 
 def split_name(text: str) -> list[str]:
-    """Split a name into words: ``jointPositions[2]`` becomes joint, positions, 2."""
+    """Split a name into words in lower case: ``jointPositions[2]`` becomes joint, positions, 2.
+
+    Words end at punctuation, at capital letters and before digits. Words such as ``qdes``, which
+    consist of a quantity and a word for a command, are divided into both.
+    """
     spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
     words = []
     for part in re.split(r"[\W_]+|(?<=[^\W\d_])(?=\d)", spaced):
-        joined_words = _JOINED_WORDS_PATTERN.fullmatch(part.lower())
-        words += [joined_words["what"], joined_words["command"]] if joined_words else [part.lower()]
+        word = part.lower()
+        joined_words = _JOINED_WORDS_PATTERN.fullmatch(word)
+        words += joined_words.groups() if joined_words else [word]
     return [word for word in words if word]
 
 
 def guess_role(column: LogColumn) -> Role | None:
-    """Return the role of a column by its name and unit, else by its file's name, or None.
+    """Guess the role of a column from its name and unit, or else from the name of its file.
 
-    Words for a command come first: ``position_command`` is a command. Then the quantity of the
-    column's unit decides, such as "torque" for N*m, and then other words of the names.
+    The first of these decides:
+
+    1. Words for a command in the column's name: ``position_command`` is a command. In the file's
+       name they count unless the column's name has a word for another quantity, such as an error.
+    2. The quantity of the column's unit, such as "torque" for N*m.
+    3. Other words of the column's name, then of the file's name.
 
     Returns:
         Command, position, velocity, force or other; None if nothing indicates a role.
@@ -136,10 +145,10 @@ def guess_role(column: LogColumn) -> Role | None:
 
 
 def get_commanded_role(column: LogColumn) -> Role | None:
-    """Return the role of a command: it sets a position, a velocity or a force; None if unknown.
+    """Return the quantity that a command sets: position, velocity, force or other; None if unknown.
 
-    The quantity that belongs to the column's unit decides (such as "angle" for rad). Without a
-    unit, words of the column's name do, then words of its file's name.
+    The column's unit decides (an angle or a length is a position). Without a unit, words of the
+    column's name do, then words of its file's name.
     """
     if column.quantity in _ROLE_OF_QUANTITY:
         return _ROLE_OF_QUANTITY[column.quantity]
@@ -168,8 +177,9 @@ def _guess_role(words: set[str]) -> Role | None:
     """Return the role of a signal that words indicate; None if they indicate none.
 
     Clear words decide first. `current` in "current position" is not an electric current, and a
-    joint state may be a velocity; so words such as `current`, `load`, `joint` and `state` only
-    decide if no other word does.
+    joint state may be a velocity; so the ambiguous words `current` and `load`, and after them
+    `joint` and `state`, only decide if no other word does. Of several roles, the first of other,
+    velocity, force and position is returned.
 
     Args:
         words: Words of a column's or file's name, in lower case.
@@ -189,7 +199,8 @@ def _guess_role(words: set[str]) -> Role | None:
 def match_joint(column: LogColumn, joints: Sequence[Joint]) -> Joint | None:
     """Return the joint whose name is part of a column's name; the longest if there are several.
 
-    If no whole name matches, names without common words are tried: ``elbow`` for ``elbow_joint``.
+    If no whole name matches, names without words that all joints share are tried: ``elbow`` for
+    ``elbow_joint``. Case and punctuation do not count.
 
     Args:
         column: Column of a log.
@@ -206,12 +217,13 @@ def match_joint(column: LogColumn, joints: Sequence[Joint]) -> Joint | None:
             if _strip_punctuation(name) and _strip_punctuation(name) in text
         ]
         if matches:
-            return max(matches, key=lambda pair: pair[0])[1]
+            _, longest_match = max(matches, key=lambda length_and_joint: length_and_joint[0])
+            return longest_match
     return None
 
 
 def _strip_shared_words(joints: Sequence[Joint]) -> list[str]:
-    """Return joint names without words that all may share: ``elbow`` for ``elbow_joint``.
+    """Return joint names without words that any joint may have: ``elbow`` for ``elbow_joint``.
 
     Args:
         joints: Joints of the robot.
@@ -235,15 +247,16 @@ def match_numbered_joints(
 ) -> dict[str, Joint]:
     """Assign joints to numbered columns of one kind, in the order of the model.
 
-    The column with the smallest number, such as ``q0`` or ``q1``, belongs to the first joint.
+    The last number of a name counts. The column with the smallest number, such as ``q0`` or ``q1``,
+    belongs to the first joint; a number that is left out leaves out a joint.
 
     Args:
         columns: Columns with a number in their names.
         joints: Joints of the robot in the order of the model.
 
     Returns:
-        Joints by column name; empty if a column has no number, numbers repeat, or there are more
-            columns than joints.
+        Joints by column name; empty if a column has no number, numbers repeat, or a number exceeds
+            the number of joints.
     """
     column_numbers: dict[str, int] = {}
     for column in columns:
@@ -251,29 +264,34 @@ def match_numbered_joints(
         if not digits:
             return {}
         column_numbers[column.name] = int(digits[-1])
-    first = min(column_numbers.values(), default=0)
-    if len(columns) > len(joints) or len(set(column_numbers.values())) < len(columns):
+    if not columns or len(set(column_numbers.values())) < len(columns):
         return {}
-    order = {name: index - first for name, index in column_numbers.items()}
-    if max(order.values(), default=0) >= len(joints):
+    first, last = min(column_numbers.values()), max(column_numbers.values())
+    if last - first >= len(joints):
         return {}
-    return {name: joints[index] for name, index in order.items()}
+    return {name: joints[number - first] for name, number in column_numbers.items()}
 
 
 def list_clock_columns(columns: Iterable[LogColumn]) -> list[LogColumn]:
     """Return the columns that may be time stamps, the most likely first.
 
-    The order is: the stamp of a message's header, other columns with a name or unit of time, and
-    increasing columns with other names.
+    Time stamps increase from row to row. The order is: stamps of a message's header, other columns
+    with a name or unit of time, and increasing columns with other names. A few repeated stamps are
+    allowed in columns with a name or unit of time.
     """
-    ranked_columns = []
-    for position, column in enumerate(columns):
+    header_stamps, named_stamps, increasing_columns = [], [], []
+    for column in columns:
         words = set(split_name(column.bare))
         is_named = bool(words & TIME_COLUMN_NAMES) or column.quantity == "time"
-        if _is_increasing(column.values, MAX_REPEATED if is_named else 0.0):
-            is_header_stamp = is_named and "header" in words
-            ranked_columns.append((not is_header_stamp, not is_named, position, column))
-    return [column for *_, column in sorted(ranked_columns, key=lambda ranked: ranked[:3])]
+        if not _is_increasing(column.values, MAX_REPEATED if is_named else 0.0):
+            continue
+        if not is_named:
+            increasing_columns.append(column)
+        elif "header" in words:
+            header_stamps.append(column)
+        else:
+            named_stamps.append(column)
+    return [*header_stamps, *named_stamps, *increasing_columns]
 
 
 def guess_time_unit(stamps: Array) -> str | None:
@@ -283,24 +301,23 @@ def guess_time_unit(stamps: Array) -> str | None:
         stamps: (T,) time stamps in an unknown unit.
 
     Returns:
-        Unit for which the median interval is a sampling rate within `SAMPLING_RATE_RANGE_HZ`.
+        First of s, ms, us and ns for which the median interval gives a sampling rate within
+        `SAMPLING_RATE_RANGE_HZ`.
     """
     steps = np.diff(stamps)
     interval = float(np.median(steps[steps > 0]))
-    for unit, second in TIME_UNITS.items():
-        if (
-            SAMPLING_RATE_RANGE_HZ[0]
-            <= 1.0 / max(interval * second, 1e-300)
-            <= SAMPLING_RATE_RANGE_HZ[1]
-        ):
+    min_rate, max_rate = SAMPLING_RATE_RANGE_HZ
+    for unit, seconds_per_unit in TIME_UNITS.items():
+        rate = 1.0 / max(interval * seconds_per_unit, 1e-300)
+        if min_rate <= rate <= max_rate:
             return unit
     return None
 
 
 def guess_position_unit(values: Array, joint: Joint) -> str | None:
-    """Return the unit of a position, rad or deg (m or mm for a slide joint), by the joint's range.
+    """Guess the unit of a position from the joint's range: rad or deg, for a slide joint m or mm.
 
-    It is the first of these units in which the positions lie within the widened range. For a joint
+    It is the first of these units in which the positions lie within the widened range. For a hinge
     without a range, angles of more than two turns in rad are taken for degrees.
 
     Args:
@@ -310,29 +327,29 @@ def guess_position_unit(values: Array, joint: Joint) -> str | None:
     Returns:
         The unit, or None if neither fits the range.
     """
-    si_unit, small_unit, size = (
-        ("rad", "deg", DEGREES_PER_RADIAN) if joint.kind == "hinge" else ("m", "mm", 1e3)
-    )
+    is_hinge = joint.kind == "hinge"
+    si_unit, small_unit = ("rad", "deg") if is_hinge else ("m", "mm")
     extremes = np.array([np.nanmin(values), np.nanmax(values)])
     if joint.range is None:
-        if joint.kind != "hinge" or np.abs(extremes).max() <= MAX_UNLIMITED_POSITION_RAD:
-            return si_unit
-        return small_unit
-    for unit, size_of_unit in ((si_unit, 1.0), (small_unit, size)):
-        if _is_within_limits(extremes / size_of_unit, joint.range):
-            return unit
-    return None
+        is_in_degrees = is_hinge and np.abs(extremes).max() > MAX_UNLIMITED_POSITION_RAD
+        return small_unit if is_in_degrees else si_unit
+    if _is_within_limits(extremes, joint.range):
+        return si_unit
+    converted_extremes = extremes / (DEGREES_PER_RADIAN if is_hinge else 1e3)
+    return small_unit if _is_within_limits(converted_extremes, joint.range) else None
 
 
 def _is_within_limits(extremes: Array, limits: tuple[float, float]) -> bool:
-    """Return whether a lowest and a highest position lie within a joint's widened range.
+    """Return whether positions lie within a joint's range, widened by `MAX_RANGE_EXCESS` of it.
 
     Args:
         extremes: (2,) lowest and highest position.
         limits: range of the joint, in the same unit.
     """
-    slack = MAX_RANGE_EXCESS * (limits[1] - limits[0])
-    return bool(limits[0] - slack <= extremes[0] and extremes[1] <= limits[1] + slack)
+    lower_limit, upper_limit = limits
+    slack = MAX_RANGE_EXCESS * (upper_limit - lower_limit)
+    lowest, highest = extremes
+    return bool(lower_limit - slack <= lowest and highest <= upper_limit + slack)
 
 
 def is_constant(values: Array) -> bool:
@@ -340,17 +357,19 @@ def is_constant(values: Array) -> bool:
     return bool(np.nanmax(values) == np.nanmin(values))
 
 
-def _is_increasing(values: Array, repeated: float) -> bool:
+def _is_increasing(values: Array, max_repeated: float) -> bool:
     """Return whether a column increases from row to row, except for a share of repeated rows.
 
     Args:
-        values: (T,) numbers of the column.
-        repeated: largest share of rows that repeat the one before.
+        values: (T,) numbers of the column; a missing one makes the result False.
+        max_repeated: largest share of rows that may repeat the one before.
     """
     if values.size < 2 or not np.isfinite(values).all():
         return False
     steps = np.diff(values)
-    return bool((steps >= 0).all() and steps.any() and (steps == 0).sum() <= repeated * values.size)
+    return bool(
+        (steps >= 0).all() and steps.any() and (steps == 0).sum() <= max_repeated * values.size
+    )
 
 
 def _strip_punctuation(text: str) -> str:

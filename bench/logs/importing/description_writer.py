@@ -54,13 +54,12 @@ class DescriptionWriter:
         self._model, self._folder, self._result = model, folder, result
 
     def write(self) -> str:
-        """Return the description.
+        """Return the text of the description in TOML.
 
-        It has the time, the runs, actuators that are missing in the model file, channels, inputs
-        and extra columns. Guesses have a comment.
-
-        Returns:
-            Text of the TOML file.
+        Its body has the time, the runs, servos that are missing in the model file, channels, inputs
+        and columns that may switch drives. Its head, which depends on the body, has what the user
+        must check as comments, the model file, and the unknown gains of servos. Guesses have a
+        comment.
         """
         servos = [
             self._estimate_added_servo(*named_servo)
@@ -90,8 +89,9 @@ class DescriptionWriter:
         head += [f"model = {toml_text(self._make_relative(self._model))}"]
         free_servos = [servo.name for servo in servos if servo.is_free]
         if free_servos:
+            # An asterisk stands for all servos.
             places = ["*"] if len(free_servos) == len(servos) else free_servos
-            names = [f"{number}@{place}" for place in places for number in FREE_GAINS]
+            names = [f"{gain}@{place}" for place in places for gain in FREE_GAINS]
             name_list = ", ".join(map(toml_text, names))
             head.append(f"free = [{name_list}]  # not known: they are estimated")
         return "\n".join([*head, "", *body]).rstrip("\n") + "\n"
@@ -107,9 +107,10 @@ class DescriptionWriter:
         yield ""
 
     def _run_lines(self) -> Iterator[str]:
-        """Yield a table `[runs.NAME]` for each run: its file or folder, and whether it is held out.
+        """Yield the lines of a table `[runs.NAME]` for each run.
 
-        A single run without a name has no table.
+        It has the file or folder of the run, and whether it is held out. A single run without a
+        name has no table.
         """
         for run, files in self._logs.runs.items():
             if run:
@@ -122,16 +123,21 @@ class DescriptionWriter:
                 yield ""
 
     def _format_file_lines(self, file: str) -> list[str]:
-        """Return the line with the file of a signal; none if each run is one file."""
+        """Return the line with the file of a signal; none if each run is one file.
+
+        Args:
+            file: name of the file in the folder of its run.
+        """
         runs = self._logs.runs
         if next(iter(runs.values())).alone:
             return []
+        # A single run without a name has no table that states its folder.
         if "" in runs:
             file = self._make_relative(runs[""].folder / file)
         return [f"file = {toml_text(file)}"]
 
     def _format_signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
-        """Return the lines of a channel or an input.
+        """Return the lines of a channel or an input, and list it as a guess in the import's result.
 
         Args:
             kind: table of the signal, ``channels`` or ``inputs``.
@@ -142,7 +148,7 @@ class DescriptionWriter:
         lines = [f"[{kind}.{toml_text(name)}]  # guess: {signal.description}"]
         lines += self._format_file_lines(column.file)
         lines += [f"column = {toml_text(column.name)}", f"unit = {toml_text(signal.unit)}"]
-        # A stated scale shows that the user knows that positions are not normalised.
+        # A scale in the description shows later checks that the positions are not normalised.
         is_stated = self._options.position_unit == "deg" and name.startswith("q.")
         if signal.scale != 1.0 or is_stated:
             lines.append(f"scale = {signal.scale!r}")
@@ -154,12 +160,13 @@ class DescriptionWriter:
         return [*lines, ""]
 
     def _estimate_added_servo(self, name: str, joint: Joint) -> AddedServo:
-        """Estimate the gains of a servo that the model file lacks, and tell the user their origin.
+        """Estimate the gains of a servo that the model file lacks, and report their origin.
 
-        If the log moves the joint, the gains are free: `explain` fits them, starting from values
-        measured from the response to the command, or else from those of a typical servo. This is
-        listed with the guesses. If the log does not move the joint, the gains are fixed and only
-        hold its position. The user has to check this, so it is listed with the checks.
+        * If the log moves the joint, the gains are free: `explain` fits them, starting from values
+          measured from the response to the command, or else from those of a typical servo. This is
+          listed with the guesses.
+        * If the log does not move the joint, the gains are fixed and only hold its position. The
+          user has to check this, so it is listed with the checks.
 
         Args:
             name: name of the new servo.
@@ -189,7 +196,8 @@ class DescriptionWriter:
     def _collect_servo_samples(self, name: str, joint: Joint) -> list[tuple[Array, Array, Array]]:
         """Return times (s), commands and positions (T,) of a servo in each run, in rad or m.
 
-        A command holds until the next one.
+        A command holds until the next one, since it has other sample times than the position. Runs
+        without one of them are left out.
 
         Args:
             name: name of the servo.
@@ -206,8 +214,14 @@ class DescriptionWriter:
             if command_samples is None or measured is None:
                 continue
             times, values = measured
-            u = command.convert(joint.unit, hold_signal(*command_samples, times))
-            samples.append((times, u, position.convert(joint.unit, values)))
+            held_command = hold_signal(*command_samples, times)
+            samples.append(
+                (
+                    times,
+                    command.convert(joint.unit, held_command),
+                    position.convert(joint.unit, values),
+                )
+            )
         return samples
 
     def _make_relative(self, path: Path) -> str:

@@ -77,14 +77,15 @@ def find_order_by_model(
 
     A log often does not name the joints of its columns. In the right order, the forces that the
     motion needs by inverse dynamics are those that the actuators exert under the recorded commands;
-    in a wrong order they are not. Velocities and accelerations come from smoothed positions.
+    in a wrong order they are not. Velocities and accelerations come from smoothed positions
+    (Savitzky-Golay filter).
 
     Args:
         robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-        driven: Joints with their actuators, in the model's order.
+        driven: J joints with their actuators, in the model's order.
         times: (T,) seconds.
-        commands: (T,) command of each actuator, SI units.
-        positions: (T,) position of each joint, SI units.
+        commands: (T,) command in each of J columns, SI units.
+        positions: (T,) position in each of J columns, SI units.
 
     Returns:
         The best order; None if the motion is too short or there are fewer than two joints.
@@ -98,61 +99,64 @@ def find_order_by_model(
 
     t, u, q = times[is_usable], np.array(commands)[:, is_usable], np.array(positions)[:, is_usable]
     step = float(np.median(np.diff(t)))
-    derivatives = [
-        savgol_filter(q, SMOOTHING_WINDOW, SMOOTHING_DEGREE, deriv=k, delta=step, axis=1)
-        for k in range(3)
-    ]
-    motion = np.stack(derivatives)
+    # (3, J, T): positions, velocities and accelerations.
+    motion = np.stack(
+        [
+            savgol_filter(q, SMOOTHING_WINDOW, SMOOTHING_DEGREE, deriv=k, delta=step, axis=1)
+            for k in range(3)
+        ]
+    )
+    # Evenly spaced instants, except at the ends, where the filter has no full window.
     window_centres = np.linspace(
         SMOOTHING_WINDOW,
         t.size - SMOOTHING_WINDOW - 1,
         min(MAX_INSTANTS, t.size - 2 * SMOOTHING_WINDOW),
     )
-    rows = np.unique(window_centres.astype(np.intp))
+    samples = np.unique(window_centres.astype(np.intp))
+    u, motion = u[:, samples], motion[:, :, samples]
     residuals = {
-        order: _compute_order_residual(
-            robot, driven, u[list(order)][:, rows], motion[:, list(order)][:, :, rows]
-        )
+        order: _compute_order_residual(robot, driven, u[list(order)], motion[:, list(order)])
         for order in _iterate_orders([joint.name for joint, _ in driven])
     }
     best = min(residuals, key=lambda order: residuals[order])
-    return PreferredOrder(best, residuals[best], residuals[tuple(range(len(driven)))])
+    model_order = tuple(range(len(driven)))
+    return PreferredOrder(best, residuals[best], residuals[model_order])
 
 
 def _iterate_orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
     """Yield the orders of the columns that are tested, each as the column index of every joint.
 
-    For few joints they are all permutations; otherwise the stated, the alphabetical and the
-    reversed order, each also with two joints exchanged.
+    For few joints they are all permutations; otherwise the order of the model, the alphabetical and
+    the reversed order, each also with every pair of joints exchanged.
+
+    Args:
+        names: names of the joints, in the order of the model.
     """
     count = len(names)
     if count <= ALL_ORDERS:
         yield from permutations(range(count))
         return
-    by_name = sorted(range(count), key=lambda place: names[place])
-    as_stated = list(range(count))
-    # The column of joint j is at the index of its name in the sorted list.
-    alphabetical = [by_name.index(j) for j in range(count)]
-    for order in (as_stated, alphabetical, as_stated[::-1]):
+    model_order = list(range(count))
+    joints_by_name = sorted(model_order, key=lambda joint: names[joint])
+    # If columns are sorted by name, the column of a joint is at the index of its name.
+    alphabetical = [joints_by_name.index(joint) for joint in model_order]
+    for order in (model_order, alphabetical, model_order[::-1]):
         yield tuple(order)
         for first, second in combinations(range(count), 2):
             exchanged_order = list(order)
-            exchanged_order[first], exchanged_order[second] = (
-                exchanged_order[second],
-                exchanged_order[first],
-            )
+            exchanged_order[first], exchanged_order[second] = order[second], order[first]
             yield tuple(exchanged_order)
 
 
 def _compute_order_residual(
     robot: RobotModel, driven: Sequence[tuple[Joint, Actuator]], commands: Array, motion: Array
 ) -> float:
-    """Compute how badly the actuators explain the motion if the columns have this order.
+    """Compute how badly the actuators explain a motion, to rate an order of the columns.
 
     With the force f_j that joint j needs for the motion and the force a_j that its actuator exerts,
     it is R = sqrt(sum_j mean((f_j - a_j)^2) / sum_j mean(a_j^2)) (1): small in the right order,
-    about 1 otherwise. It is infinite if joints would be far beyond their ranges. Contacts and joint
-    limits are switched off.
+    about 1 otherwise. It is infinite if a joint would be far beyond its range, or no actuator
+    exerts a force. Contacts and joint limits are switched off.
 
     Args:
         robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -164,8 +168,9 @@ def _compute_order_residual(
 
     for (joint, _), q in zip(driven, motion[0], strict=True):
         if joint.range is not None:
-            slack = 0.5 * (joint.range[1] - joint.range[0])
-            if q.min() < joint.range[0] - slack or q.max() > joint.range[1] + slack:
+            low, high = joint.range
+            slack = 0.5 * (high - low)
+            if q.min() < low - slack or q.max() > high + slack:
                 return np.inf
     model = copy.copy(robot.compiled)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -189,32 +194,34 @@ MIN_SAMPLES = 20
 def find_order_by_commands(
     commands: Sequence[Array], positions: Sequence[Array]
 ) -> list[int] | None:
-    """Find the order of positions that follows commands best, as a log may not name its columns.
+    """Find the order of position columns in which they follow their commands best.
 
     Args:
         commands: (T,) command of each joint, SI units.
-        positions: (T,) position of each joint at the same times, SI units.
+        positions: (T,) position in each column at the same times, SI units.
 
     Returns:
         For each command the index of the position that follows it; None if the present order
-            follows about as well, or the motion is not informative.
+        follows about as well, or the motion is too short.
     """
     distances = _compute_square_distances(commands, positions)
     if distances is None:
         return None
     order = find_best_order(distances)
-    moved_places = [i for i, place in enumerate(order) if place != i]
-    if not moved_places:
+    moved_commands = [command for command, position in enumerate(order) if position != command]
+    if not moved_commands:
         return None
-    unchanged_distance = float(np.sqrt(distances[moved_places, moved_places].sum()))
-    reordered_distance = float(
-        np.sqrt(distances[moved_places, [order[i] for i in moved_places]].sum())
-    )
+    # Root mean square distances over the commands whose position would change.
+    new_positions = [order[command] for command in moved_commands]
+    unchanged_distance = float(np.sqrt(distances[moved_commands, moved_commands].sum()))
+    reordered_distance = float(np.sqrt(distances[moved_commands, new_positions].sum()))
     return order if reordered_distance < MAX_DISTANCE_RATIO * unchanged_distance else None
 
 
-def follow(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
-    """Return whether each position is closer to its own command than to any other one.
+def are_followed(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
+    """Return whether each command is closer to the position of its joint than to any other one.
+
+    It is False if the motion is too short to decide.
 
     Args:
         commands: (T,) command of each joint, SI units.
@@ -246,13 +253,14 @@ def find_best_order(distances: Array) -> list[int]:
 def _compute_square_distances(
     commands: Sequence[Array], positions: Sequence[Array]
 ) -> Array | None:
-    """Return the (J, J) mean square distance of each command from each position.
-
-    Returns None if the motion is too short, or of one joint only.
+    """Return the mean square distance of each command from each position.
 
     Args:
-        commands: Command of each joint, (T,) in SI units.
-        positions: Position in each column, (T,) in SI units.
+        commands: Command of each of J joints, (T,) in SI units.
+        positions: Position in each of J columns, (T,) in SI units.
+
+    Returns:
+        (J, J) distances, commands in rows; None if the motion is too short, or of one joint only.
     """
     command_table, position_table = np.array(commands), np.array(positions)
     finite = np.isfinite(command_table).all(axis=0) & np.isfinite(position_table).all(axis=0)
@@ -291,9 +299,11 @@ def assign_order(
 ) -> Mapping[str, str]:
     """Correct the order of joints in unnamed columns, and report which order is a guess.
 
-    Such columns were assigned in the order of the model. If positions follow the commands better in
-    another order, columns are exchanged. If both orders are guesses that agree, the order is sought
-    in which the model explains the motion.
+    Such columns were assigned in the order of the model, which is a guess.
+
+    * If positions follow the commands better in another order, columns are exchanged.
+    * If the orders of commands and positions are both guesses and agree with each other, both may
+      be wrong: columns are exchanged if the model explains the motion better in another order.
 
     Args:
         logs: Logs that are imported.
@@ -302,15 +312,13 @@ def assign_order(
         result: Result to which messages are added.
 
     Returns:
-        For each joint, the joint at whose index its column is, if positions were exchanged.
+        For each joint, the joint at whose index its position column is; empty if positions were not
+        exchanged.
     """
     servos = _collect_servo_signals(logs, signals)
-    are_commands_guessed, are_positions_guessed = (
-        all(table[name].placement.is_order for name in names)
-        for table, names in (
-            (signals.inputs, servos.inputs),
-            (signals.channels, servos.channels),
-        )
+    are_commands_guessed = all(signals.inputs[name].placement.is_order for name in servos.inputs)
+    are_positions_guessed = all(
+        signals.channels[name].placement.is_order for name in servos.channels
     )
     if not servos.commands:
         _report_order(signals, [], result)
@@ -318,8 +326,9 @@ def assign_order(
     exchanged = {}
     if are_commands_guessed or are_positions_guessed:
         exchanged = _follow_commands(signals, servos, are_commands_guessed)
-    is_following = follow(servos.commands, servos.positions) or bool(exchanged)
+    is_following = are_followed(servos.commands, servos.positions) or bool(exchanged)
     are_both_guessed = are_commands_guessed and are_positions_guessed
+    # Normalised positions have no known scale, so the model cannot explain them.
     if are_both_guessed and is_following and not exchanged and not is_normalised:
         preferred = _prefer_model(logs, signals, servos, result)
         if preferred:
@@ -331,8 +340,8 @@ def assign_order(
 def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSignals:
     """Collect the joints that have a servo, a recorded command and a recorded position.
 
-    Their values (T,) are included only if the order of the columns is a guess, to test other
-    orders.
+    Their values (T,) are included only if they are needed and suitable to test other orders: the
+    order of some columns is a guess, there are several joints, and all have the same sample times.
 
     Args:
         logs: logs of all runs, with their time stamps and columns.
@@ -351,12 +360,13 @@ def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSi
         for u, name in zip(inputs, names, strict=True)
     ]
     is_guess = any(signal.placement.is_order for pair in pairs for signal in pair)
-    signal_pairs = [logs.hold_command(u.column, q.column) for u, q in pairs]
+    # Command and position at the sample times of the position.
+    value_pairs = [logs.hold_command(u.column, q.column) for u, q in pairs]
     # Positions of one file share their sample times; those of several files may not.
-    if len(joints) < 2 or not is_guess or len({u.size for u, _ in signal_pairs}) > 1:
+    if len(joints) < 2 or not is_guess or len({u.size for u, _ in value_pairs}) > 1:
         return _ServoSignals(names, inputs, [], [])
     commands, positions = [], []
-    for joint, (command, position), (u, q) in zip(joints, pairs, signal_pairs, strict=True):
+    for joint, (command, position), (u, q) in zip(joints, pairs, value_pairs, strict=True):
         commands.append(command.convert(joint.unit, u))
         positions.append(position.convert(joint.unit, q))
     return _ServoSignals(names, inputs, commands, positions)
@@ -375,7 +385,8 @@ def _follow_commands(
         are_commands_guessed: whether the order of the commands is a guess.
 
     Returns:
-        For each joint, the joint at whose index its column is; empty if nothing is exchanged.
+        For each joint, the joint at whose index the position is that follows its command; empty if
+        nothing is exchanged.
     """
     order = find_order_by_commands(servos.commands, servos.positions)
     if order is None:
@@ -387,13 +398,13 @@ def _follow_commands(
         _reorder(signals.inputs, servos.inputs, inverse_order, Placement.COMMANDS)
     else:
         _reorder(signals.channels, servos.channels, order, Placement.COMMANDS)
-    return {joint: joints[place] for place, joint in zip(order, joints, strict=True)}
+    return {joint: joints[index] for joint, index in zip(joints, order, strict=True)}
 
 
 def _reorder(
     table: dict[str, Signal], names: Sequence[str], order: Sequence[int], placement: Placement
 ) -> None:
-    """Exchange the columns of signals.
+    """Exchange the columns of signals, and note the reason for the new order.
 
     Args:
         table: channels or inputs of the assignment, changed in place.
@@ -401,9 +412,9 @@ def _reorder(
         order: for each name, the index of the name whose column it gets.
         placement: reason for the new order.
     """
-    columns = [table[name] for name in names]
-    for name, place in zip(names, order, strict=True):
-        table[name] = columns[place].with_placement(placement)
+    old_signals = [table[name] for name in names]
+    for name, index in zip(names, order, strict=True):
+        table[name] = old_signals[index].with_placement(placement)
 
 
 def _prefer_model(
@@ -430,7 +441,8 @@ def _prefer_model(
         for joint, actuator in zip(joints, actuators, strict=True)
         if actuator is not None
     ]
-    # Unknown gains explain nothing.
+    # A servo that the model file lacks has unknown gains, and so unknown forces. Numbers in the
+    # names of columns that are those of the joints confirm the order.
     if len(driven) < len(joints) or all(map(signals.has_number_of_joint, joints)):
         return {}
     seconds = logs.seconds[signals.channels[servos.channels[0]].column.file]
@@ -449,13 +461,15 @@ def _prefer_model(
         f"{preferred.model_order_residual:.2g} in the model's "
         f"order, {', '.join(joints)}); it is a guess: compare it with the logger's order"
     )
-    return {joint: joints[place] for joint, place in zip(joints, preferred.order, strict=True)}
+    return {joint: joints[index] for joint, index in zip(joints, preferred.order, strict=True)}
 
 
 def _report_order(
     signals: SignalAssignment, following_joints: Sequence[str], result: ImportResult
 ) -> None:
-    """Report which positions follow their commands, and which joint orders are a guess.
+    """Report which orders of joints are a guess, and mark those that the motion confirms.
+
+    Nothing is reported if names of columns or numbers in them confirm the order.
 
     Args:
         signals: Signals of the robot.

@@ -32,10 +32,10 @@ def describe_logs(
 ) -> ImportResult:
     """Find what the columns of a robot's logs contain, and describe the recording.
 
-    Columns are assigned to signals one kind after the other: positions, commands, velocities,
-    efforts, and columns that may switch drives. Then the description is written, in which every
-    guess is marked. The result lists the columns that are not used, and points that the user must
-    check.
+    Columns are assigned to signals one kind after the other, since later kinds depend on earlier
+    ones: positions, commands, velocities, efforts, and columns that may switch drives. Then the
+    description is written, in which every guess is marked. The result lists the columns that are
+    not used, and points that the user must check.
 
     Args:
         logs: Files of one run, folders with the files of one run each, or datasets of LeRobot.

@@ -57,11 +57,11 @@ class NormalisedPositions(NamedTuple):
     def get_position_scale(
         self, column: str, values: Array, joint: Joint
     ) -> tuple[str, AngleScale] | None:
-        """Return the unit of a column's positions, and their conversion to it.
+        """Return the unit to which a column's positions are converted, and the conversion.
 
-        The calibration of a motor gives angles in degrees. Without one, the normalised range is
-        mapped to the range of the joint in the model. Grippers count from 0 to 100, others from
-        -100 to 100.
+        The calibration of a hinge's motor gives angles in degrees. Without one, the normalised
+        range is mapped to the range of the joint in the model. Grippers count from 0 to 100, other
+        motors from -100 to 100.
 
         Args:
             column: Name of the column.
@@ -70,7 +70,7 @@ class NormalisedPositions(NamedTuple):
 
         Returns:
             Unit and conversion; None if neither a calibration nor the model gives the joint's
-                range.
+            range.
         """
         from_zero = "gripper" in column.lower() and float(np.nanmin(values)) >= 0.0
         motor = find_motor(column, self.motors)
@@ -95,33 +95,34 @@ def find_position_conversion(
 ) -> NormalisedPositions | None:
     """Return the conversion of normalised positions to angles; None if they are angles already.
 
-    They are normalised if the user says so or names a calibration file, or if they lie within -100
-    to 100 and the dataset has a calibration file.
+    They are normalised in two cases: the user says so or names a calibration file; or the user
+    states no unit, they lie within -100 to 100, and a calibration file is in the LeRobot dataset or
+    next to it.
 
     Args:
         log: Log that contains the positions.
         largest: Largest magnitude of the positions.
         stated_unit: Unit that the user states; empty if none is stated.
-        calibration: File that the user names; None to search one in and next to the dataset.
+        calibration: Calibration file that the user names, or None.
 
     Raises:
         InputError: Positions stated as normalised are out of range, or the file cannot be read.
     """
-    is_within = largest <= MAX_NORMALISED
-    is_requested = stated_unit == "normalised" or calibration is not None
-    if is_requested and not is_within:
+    is_within_range = largest <= MAX_NORMALISED
+    is_normalised = stated_unit == "normalised" or calibration is not None
+    if is_normalised and not is_within_range:
         raise InputError(
             f"{log}: expected normalised positions within -100 to 100, found {largest:.4g}; leave "
             "out --calibration and --position-unit normalised"
         )
-    if calibration is None and is_within and not stated_unit:
+    if calibration is None and is_within_range and not stated_unit:
         episode = split_episode_path(log)
         if episode:
-            dataset = episode[0]
+            dataset, _ = episode
             folders = [dataset, dataset / "meta", dataset / "calibration", dataset.parent]
             calibration = find_calibration(folders)
-        is_requested = calibration is not None
-    if not is_requested:
+        is_normalised = calibration is not None
+    if not is_normalised:
         return None
     motors = read_calibration(calibration) if calibration is not None else {}
     return NormalisedPositions(motors, calibration)
@@ -136,10 +137,10 @@ def is_lerobot(log: Path, columns: Iterable[str]) -> bool:
 
 
 def check_normalised_positions(recording: Recording) -> Iterator[Anomaly]:
-    """Yield an anomaly if positions of a LeRobot dataset in degrees may be normalised.
+    """Yield an anomaly if positions of a LeRobot dataset may be normalised and not in degrees.
 
-    That is so if all of them lie within -100 to 100; channels whose description states a `scale`
-    are not checked.
+    That is so if the description states degrees and all positions lie within -100 to 100. A `scale`
+    in the description shows that the user knows the unit, so channels with one are not checked.
     """
     description = recording.path.with_suffix(".toml")
     if not description.is_file():
@@ -156,14 +157,14 @@ def check_normalised_positions(recording: Recording) -> Iterator[Anomaly]:
         and str(table.get("unit", "")).startswith("deg")
         and "scale" not in table
     ]
-    values = [
-        run.channels[name]
+    # The recording is in radians.
+    largest_angles = [
+        float(np.nanmax(np.abs(run.channels[name]), initial=0.0))
         for run in recording.runs
         for name in names_in_degrees
         if name in run.channels
     ]
-    largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in values), default=np.inf)
-    if np.degrees(largest) <= MAX_NORMALISED:
+    if largest_angles and np.degrees(max(largest_angles)) <= MAX_NORMALISED:
         yield Anomaly(
             "positions of a LeRobot dataset are read as degrees and lie within -100 to 100, as "
             f"normalised ones do; {UNIT_REMEDY} (scale = 1 in the description)",
@@ -172,15 +173,20 @@ def check_normalised_positions(recording: Recording) -> Iterator[Anomaly]:
 
 
 def _has_dataset_episodes(description: Path, meta: Mapping[str, object]) -> bool:
-    """Return whether a description's runs are episodes of a dataset."""
+    """Return whether the runs of a description are episodes of a LeRobot dataset.
+
+    The first run that states its folder decides.
+
+    Args:
+        description: path of the description, to which folders are relative.
+        meta: content of the description.
+    """
     runs = meta.get("runs")
     tables = runs.values() if isinstance(runs, dict) else ()
-    folders = [table.get("folder") for table in tables if isinstance(table, dict)]
-    return any(
-        isinstance(folder, str)
-        and split_episode_path(description.parent / folder / "frames") is not None
-        for folder in folders[:1]
-    )
+    folder = next((table.get("folder") for table in tables if isinstance(table, dict)), None)
+    if not isinstance(folder, str):
+        return False
+    return split_episode_path(description.parent / folder / "frames") is not None
 
 
 COUNTS_PER_TURN = 4096
@@ -205,18 +211,19 @@ def find_motor(column: str, motors: Iterable[str]) -> str | None:
 
 
 def compute_angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
-    """Return the conversion of a normalised position to an angle in degrees.
+    """Return the conversion of a normalised position x to an angle q in degrees.
 
-    With the range r in counts and N = 4096 counts per turn, q = s x r / 200 * 360 / (N - 1) for x
-    in -100 to 100 (1), and q = s (x - 50) r / 100 * 360 / (N - 1) for x in 0 to 100 (2), in
-    degrees.
+    With the calibrated range r in encoder counts, N = 4096 counts per turn, and the sign s of the
+    motor, it is
+
+    * q = s x r / 200 * 360 / (N - 1) for x in -100 to 100 (1)
+    * q = s (x - 50) r / 100 * 360 / (N - 1) for x in 0 to 100 (2)
 
     Args:
         motor: Calibrated range of the motor.
-        from_zero: Whether positions are 0 to 100, equation (2), instead of -100 to 100, equation
-            (1).
+        from_zero: Whether positions are 0 to 100 (2) instead of -100 to 100 (1).
     """
-    # The normalised position has a range of 100 or 200 percent over these degrees.
+    # Angle over which the normalised position goes through its whole range.
     degrees = 360.0 / (COUNTS_PER_TURN - 1) * (motor.highest - motor.lowest)
     sign = -1.0 if motor.reversed else 1.0
     if from_zero:
@@ -225,7 +232,7 @@ def compute_angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
 
 
 def compute_range_scale(lowest: float, highest: float, from_zero: bool) -> AngleScale:
-    """Return the conversion of a normalised position to the unit of its range.
+    """Return the conversion of a normalised position to a position between two given ends.
 
     Args:
         lowest: Lower end of the range.

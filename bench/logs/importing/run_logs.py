@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -46,40 +47,23 @@ def group_logs_by_run(logs: Sequence[Path]) -> dict[str, RunFiles]:
     """Group logs by run: those of each folder, bag or episode, or the files themselves.
 
     A bag (ROS) and an episode of a dataset (LeRobot) are one run each. The files of one folder are
-    one run, unless all of them have the same columns: then each file is a run. The
-    only run may have the name "".
+    one run, unless it is the only one and all of its files have the same columns: then each file is
+    a run, and so is each numbered group of a single HDF5 file.
+
+    Args:
+        logs: Files, folders of files, bags or datasets, or folders that contain such.
+
+    Returns:
+        Files of each run by its name; files that are named one by one are a run with the name "".
 
     Raises:
-        InputError: There is no log.
+        InputError: There is no log, or there are both files and folders.
     """
     files = [path for path in logs if not path.is_dir() and not is_bag(path)]
     runs: dict[str, RunFiles] = {}
-    for folder in (path for path in logs if path not in files):
-        is_whole = is_bag(folder) or is_dataset(folder)
-        parts = [folder] if is_whole else [folder, *sorted(folder.iterdir())]
-        datasets = [path_or_folder for path_or_folder in parts if is_dataset(path_or_folder)]
-        for path_or_folder in parts:
-            if path_or_folder in datasets:
-                prefix = f"{path_or_folder.name}_" if len(datasets) > 1 else ""
-                runs |= {
-                    f"{prefix}{path.parent.name}": RunFiles(path.parent, [path])
-                    for path in list_logs(path_or_folder)
-                }
-                continue
-            if is_bag(path_or_folder):
-                paths = list(list_logs(path_or_folder))
-            elif path_or_folder.is_dir():
-                paths = [
-                    path
-                    for path in list_logs(path_or_folder)
-                    if path.suffix.lower() in TABLE_ENDINGS
-                ]
-            else:
-                continue
-            if paths:
-                runs[path_or_folder.stem if path_or_folder.is_file() else path_or_folder.name] = (
-                    RunFiles(path_or_folder, paths)
-                )
+    for path in logs:
+        if path not in files:
+            runs |= _find_runs_in_folder(path)
     if files and runs:
         raise InputError("expected files of one run, or folders of one run each, found both")
     if files:
@@ -94,6 +78,36 @@ def group_logs_by_run(logs: Sequence[Path]) -> dict[str, RunFiles]:
     if len(runs) == 1:
         ((name, run),) = runs.items()
         return _make_run_per_group(run) or _make_run_per_file(run) or {name: run}
+    return runs
+
+
+def _find_runs_in_folder(folder: Path) -> dict[str, RunFiles]:
+    """Return the runs of a folder, bag or dataset by name, including those one level below it.
+
+    Args:
+        folder: ROS bag, LeRobot dataset, or folder of files and of further folders.
+    """
+    is_whole = is_bag(folder) or is_dataset(folder)
+    parts = [folder] if is_whole else [folder, *sorted(folder.iterdir())]
+    datasets = [part for part in parts if is_dataset(part)]
+    runs: dict[str, RunFiles] = {}
+    for part in parts:
+        if part in datasets:
+            # Datasets number their episodes alike.
+            prefix = f"{part.name}_" if len(datasets) > 1 else ""
+            runs |= {
+                f"{prefix}{path.parent.name}": RunFiles(path.parent, [path])
+                for path in list_logs(part)
+            }
+            continue
+        if is_bag(part):
+            paths = list(list_logs(part))
+        elif part.is_dir():
+            paths = [path for path in list_logs(part) if path.suffix.lower() in TABLE_ENDINGS]
+        else:  # a file, which belongs to the run of its folder
+            continue
+        if paths:
+            runs[part.stem if part.is_file() else part.name] = RunFiles(part, paths)
     return runs
 
 
@@ -162,7 +176,8 @@ class RunLogs:
         """Read the files of the first run, find their time stamps, and list the columns to import.
 
         Without time stamps (`rate` is given), the time of row k is k / rate in seconds. `_starts`
-        has the first time stamp of each file, and `_cache` the files that were read already.
+        has the first time stamp of each file in seconds from the earliest one of all files, and
+        `_cache` the files that were read already.
 
         Args:
             runs: Files of each run.
@@ -191,11 +206,14 @@ class RunLogs:
         return next(iter(self.runs.values())).paths[0]
 
     def read(self, run: str, column: LogColumn) -> tuple[Array, Array] | None:
-        """Return time stamps (T,) in s and values (T,) of a column in a run; None if missing.
+        """Return time stamps (T,) in s and values (T,) of a column in a run.
 
         Args:
             run: Name of the run.
             column: Column to read; its file is only used if a run has several files.
+
+        Returns:
+            Time stamps and values; None if the run lacks the column or its time stamps.
         """
         files = self.runs[run]
         paths = files.paths
@@ -217,17 +235,18 @@ class RunLogs:
         return column_guessing.TIME_UNITS[self.time_unit] * stamps, values
 
     def read_runs(self, column: LogColumn) -> list[Array]:
-        """Return the values (T,) of a column in each of the first `MAX_RUNS` runs that have it."""
+        """Return the values (T,) of a column in those of the first `MAX_RUNS` runs that have it."""
         samples = [self.read(run, column) for run in list(self.runs)[:MAX_RUNS]]
         return [values for _, values in (pair for pair in samples if pair is not None)]
 
     def hold_command(self, command: LogColumn, position: LogColumn) -> tuple[Array, Array]:
-        """Return (T,) a command at the times of a position (zero-order hold), and that position.
+        """Return a command (T,) at the sample times of a position, and that position (T,).
 
-        Both are those of the first run.
+        Both are those of the first run. A command holds until the next one.
         """
         if command.file == position.file:
             return command.values, position.values
+        # Seconds count from the first stamp of each file.
         offset = self._starts[command.file] - self._starts[position.file]
         stamps = self.seconds[command.file] + offset
         return hold_signal(stamps, command.values, self.seconds[position.file]), position.values
@@ -278,7 +297,7 @@ class RunLogs:
         )
 
     def _leave_out_file(self, file: str, error: InputError, path: Path) -> None:
-        """Leave out a file of a folder with a message.
+        """Report that a file is left out, or raise the error if the user named the file.
 
         Args:
             file: name of the file in messages.
@@ -288,6 +307,7 @@ class RunLogs:
         Raises:
             InputError: The user named the file.
         """
+        # `chosen` is the same for all runs.
         if next(iter(self.runs.values())).chosen:
             raise error
         text = str(error).removeprefix(str(path)).lstrip(",: ")
@@ -296,11 +316,12 @@ class RunLogs:
     # -- time stamps
 
     def _choose_clock(self, logs: Mapping[str, LogFile]) -> None:
-        """Find the time stamps of all files, which must have a common name and unit.
+        """Choose the column of time stamps, whose name and unit all files must share.
 
         Each file has candidates; a name that all files share is preferred. The name and unit of the
         files with the most recognised columns are used, and files with other stamps are left out.
-        Times count from the first stamp of each file; `_starts` is its distance from the earliest.
+        The times `seconds` count from the first stamp of each file; `_starts` is the time from the
+        earliest stamp of all files to that one.
 
         Args:
             logs: Logs of the first run by file.
@@ -317,13 +338,13 @@ class RunLogs:
             file: next((pair for pair in candidates if pair[0].name in common), candidates[0])
             for file, candidates in clocks.items()
         }
-        counts: dict[tuple[str, str], int] = {}
+        # Number of recognised columns by name and unit of the stamps.
+        counts = Counter[tuple[str, str]]()
         for file, (column, unit) in clocks_by_file.items():
             roles = map(column_guessing.guess_role, _list_all_columns(file, logs[file]))
-            key = column.name, unit
-            counts[key] = counts.get(key, 0) + sum(role is not None for role in roles)
+            counts[column.name, unit] += sum(role is not None for role in roles)
         self.time_column, self.time_unit = max(counts, key=lambda key: counts[key])
-        zero = min(float(column.values[0]) for column, _ in clocks_by_file.values())
+        earliest_stamp = min(float(column.values[0]) for column, _ in clocks_by_file.values())
         for file, (column, unit) in clocks_by_file.items():
             if (column.name, unit) != (self.time_column, self.time_unit):
                 path = logs[file].path
@@ -337,7 +358,7 @@ class RunLogs:
             # second coarsely, so the first stamp is subtracted before scaling.
             second = column_guessing.TIME_UNITS[unit]
             self.seconds[file] = second * (column.values - column.values[0])
-            self._starts[file] = second * float(column.values[0] - zero)
+            self._starts[file] = second * float(column.values[0] - earliest_stamp)
             repeated = int((np.diff(column.values) == 0).sum())
             if repeated:
                 self._result.untold.append(
@@ -353,6 +374,8 @@ class RunLogs:
     def _list_clocks(self, logs: Mapping[str, LogFile]) -> dict[str, list[tuple[LogColumn, str]]]:
         """Return for each file the columns that may be its time stamps, with their units.
 
+        Files without such a column are left out with a message.
+
         Raises:
             InputError: A file that the user named has no such column, or no file has one.
         """
@@ -360,7 +383,7 @@ class RunLogs:
         errors: list[InputError] = []
         for file, log in logs.items():
             columns = column_guessing.list_clock_columns(_list_all_columns(file, log))
-            # The unit that the file states, else the one with a plausible rate.
+            # The unit that the file states, else the one with a plausible sampling rate.
             units = [
                 column.unit
                 if column.quantity == "time" and column.unit in column_guessing.TIME_UNITS
@@ -414,20 +437,22 @@ class RunLogs:
 
 
 def hold_signal(stamps: Array, values: Array, times: Array) -> Array:
-    """Return a signal at given times (T,) with a zero-order hold; its first value before that.
+    """Resample a signal (T,) with a zero-order hold: each value holds until the next one.
+
+    Before the first value, that value is returned.
 
     Args:
         stamps: (N,) increasing times of the values, s.
         values: (N,) values of the signal.
         times: (T,) times of the result, s.
     """
-    places = np.searchsorted(stamps, times, side="right") - 1
-    held_values: Array = values[np.clip(places, 0, values.size - 1)]
+    indices = np.searchsorted(stamps, times, side="right") - 1
+    held_values: Array = values[np.clip(indices, 0, values.size - 1)]
     return held_values
 
 
 def _list_all_columns(file: str, log: LogFile) -> list[LogColumn]:
-    """Return all numeric columns of a log.
+    """Return all numeric columns of a log; entries of lists are columns, and inf becomes NaN.
 
     Args:
         file: name of the log's file.

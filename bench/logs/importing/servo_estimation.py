@@ -74,14 +74,15 @@ def estimate_added_servo(
 ) -> AddedServo:
     """Estimate the gains kp and kv of a servo that is missing in the model file.
 
-    They follow from frequency and damping of its response and from the inertia of the joint.
-    Without motion, the gains of a usual servo are taken.
+    They follow from the natural frequency w and the damping ratio d of its response and from the
+    inertia I of the joint: kp = I w^2, kv = 2 d w I. If the log does not show the response, that of
+    a typical servo is taken.
 
     Args:
         name: Name that the servo gets.
         joint: Joint that it drives.
-        inertia: Inertia about the joint, kg m^2 or kg.
-        runs: Times, commands and positions of each run, as in `estimate_servo_response`.
+        inertia: Inertia about the joint, kg m^2, or kg for a slide joint.
+        runs: For each run, times (T,) in s, commands (T,) and positions (T,), rad or m.
     """
     estimate = estimate_servo_response(runs)
     response = estimate or DEFAULT_RESPONSE
@@ -98,8 +99,9 @@ def estimate_added_servo(
 def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> ServoResponse | None:
     """Estimate how a position follows its command: natural frequency and damping of the servo.
 
-    For each pair of a grid, the response (1) to the commands is computed. The pair with the
-    smallest residual is taken, if it explains most of the position's variance.
+    The servo is modelled as q'' = w^2 (u - q) - 2 d w q' (1). For each pair (w, d) of a grid, the
+    response to the commands is computed. The pair with the smallest residual is taken, if it
+    explains most of the position's variance.
 
     Args:
         runs: For each run (T,) times in s, about uniform, (T,) commands, each held to the next
@@ -122,14 +124,15 @@ def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> Servo
     step = float(np.median([np.median(np.diff(t)) for t, _, _ in moving]))
     responses = [ServoResponse(*pair) for pair in product(FREQUENCY_GRID, DAMPING_GRID)]
     numerators, denominators = _compute_transfer_functions(responses, step)
+    # Sum of squares of the residual over all runs, by response. The variance ignores an offset.
     residuals = np.zeros(len(responses))
     for _, command, position in moving:
         for i in range(len(responses)):
-            followed = lfilter(numerators[i], denominators[i], command - command[0])
-            residuals[i] += float(np.var(position - followed)) * position.size
-    total_variation = sum(float(np.var(position)) * position.size for _, _, position in moving)
+            response = lfilter(numerators[i], denominators[i], command - command[0])
+            residuals[i] += float(np.var(position - response)) * position.size
+    total_squares = sum(float(np.var(position)) * position.size for _, _, position in moving)
     best = int(np.argmin(residuals))
-    is_following = residuals[best] < (1.0 - MIN_EXPLAINED_VARIANCE) * total_variation
+    is_following = residuals[best] < (1.0 - MIN_EXPLAINED_VARIANCE) * total_squares
     return responses[best] if is_following else None
 
 
@@ -145,6 +148,7 @@ def _compute_transfer_functions(
         q(t) = 1 - (p2 exp(p1 t) - p1 exp(p2 t)) / (p2 - p1)                                     (2)
 
     Sampled, it is a filter of second order: a ratio of two polynomials in z, the shift by a step.
+    Its poles are exp(p1 h) and exp(p2 h), with the sampling interval h.
 
     Args:
         responses: n pairs of natural frequency w in rad/s and damping ratio d.
@@ -154,6 +158,7 @@ def _compute_transfer_functions(
         (n, 3) coefficients of the numerators and of the denominators, by descending powers of z.
     """
     frequency, damping = np.array(responses).T
+    # Below a damping ratio of 1 the poles are complex.
     root = np.emath.sqrt(damping**2 - 1.0)
     p1, p2 = -frequency * (damping - root), -frequency * (damping + root)
     z1, z2 = np.exp(p1 * step), np.exp(p2 * step)

@@ -91,6 +91,14 @@ class Signal:
         return converted
 
 
+class PlacedColumn(NamedTuple):
+    """Column of a log, its joint, and how it was assigned."""
+
+    column: LogColumn
+    joint: Joint
+    placement: Placement
+
+
 @dataclass
 class SignalAssignment:
     """Signals of a robot and their columns.
@@ -136,51 +144,57 @@ class SignalAssignment:
         added_servo = self.added_servos.get(name)
         return joint or (added_servo.name if added_servo is not None else name)
 
-    def place_columns(
-        self, columns: Sequence[LogColumn]
-    ) -> list[tuple[LogColumn, Joint, Placement]]:
-        """Assign columns of one kind to joints: by their names, else by their numbers.
+    def place_columns(self, columns: Sequence[LogColumn]) -> list[PlacedColumn]:
+        """Assign columns of one role to joints: by their names, else by their numbers.
+
+        Numbered columns are assigned together if they are in one file and differ by the last number
+        of their names alone. Columns that match no joint are left out.
 
         Args:
             columns: Columns with the same role, such as positions.
 
         Returns:
-            Each assigned column with its joint, and how it was assigned (`Placement`).
+            Each assigned column with its joint, and how it was assigned.
         """
         assignments = []
         numbered: dict[tuple[str, str], list[LogColumn]] = {}
         for column in columns:
             joint = column_guessing.match_joint(column, self.joints)
             if joint is not None:
-                assignments.append((column, joint, Placement.NAME))
+                assignments.append(PlacedColumn(column, joint, Placement.NAME))
             else:
-                # Columns of one kind differ by the last number of their names.
-                group = column.file, re.sub(r"\d+(?=\D*$)", "", column.bare)
-                numbered.setdefault(group, []).append(column)
+                name_without_number = re.sub(r"\d+(?=\D*$)", "", column.bare)
+                numbered.setdefault((column.file, name_without_number), []).append(column)
         for group_columns in numbered.values():
             joints = column_guessing.match_numbered_joints(group_columns, self.joints)
             assignments += [
-                (column, joints[column.name], Placement.MODEL_ORDER)
+                PlacedColumn(column, joints[column.name], Placement.MODEL_ORDER)
                 for column in group_columns
                 if column.name in joints
             ]
         return assignments
 
     def has_number_of_joint(self, joint: str) -> bool:
-        """Return whether the number in a joint's name is that of its column's name."""
-        numbers = [
-            [int(digits) for digits in re.findall(r"\d+", text)]
-            for text in (joint, self._get_column_name(joint))
-        ]
-        return all(numbers) and numbers[0][-1] == numbers[1][-1]
+        """Return whether the last number in a joint's name is also that of its column's name."""
+        joint_numbers = re.findall(r"\d+", joint)
+        column_numbers = re.findall(r"\d+", self._get_column_name(joint))
+        if not joint_numbers or not column_numbers:
+            return False
+        return int(joint_numbers[-1]) == int(column_numbers[-1])
 
     def _get_column_name(self, joint: str) -> str:
-        """Return the column name of a joint's position, or else of its command."""
+        """Return the column name of a joint's position, or else of its command.
+
+        The position counts only if it was assigned by the number of its column. The name is empty
+        if there is neither.
+        """
         position = self.get_position(joint)
         if position is not None and position.placement.is_order:
             return position.column.bare
-        signals = (s for name, s in self.inputs.items() if self.get_joint(name) == joint)
-        return next((signal.column.bare for signal in signals), "")
+        for name, signal in self.inputs.items():
+            if self.get_joint(name) == joint:
+                return signal.column.bare
+        return ""
 
 
 def is_convertible(unit: str, target: str) -> bool:
@@ -244,7 +258,8 @@ def assign_velocities(
 
     A robot's velocity signal may be filtered, scaled or of another time; then it would mislead a
     fit. So each column is compared with the derivative of the position, which also confirms its
-    unit. Columns of one kind, which one logger wrote in the same way, are decided together.
+    unit. Columns whose names differ by joint or number only were written in the same way, so they
+    are all assigned or all left out.
 
     Args:
         logs: Logs that are imported.
@@ -254,12 +269,17 @@ def assign_velocities(
     """
     columns = [c for c in logs.columns if column_guessing.guess_role(c) == "velocity"]
     assignments = signals.place_columns(columns)
-    by_order = {joint.name: c for c, joint, p in assignments if p is Placement.MODEL_ORDER}
-    kinds: dict[tuple[str, ...], list[_Candidate]] = {}
+    columns_by_order = {
+        joint.name: column
+        for column, joint, placement in assignments
+        if placement is Placement.MODEL_ORDER
+    }
+    candidates_by_kind: dict[tuple[str, ...], list[_Candidate]] = {}
     for own_column, joint, own_placement in assignments:
         column, placement = own_column, own_placement
+        # Columns assigned by their numbers follow the order of the positions.
         if placement is Placement.MODEL_ORDER and joint.name in exchanged:
-            column = by_order.get(exchanged[joint.name], own_column)
+            column = columns_by_order.get(exchanged[joint.name], own_column)
             placement = Placement.POSITIONS
         position = signals.get_position(joint.name)
         if position is None or position.column.file != column.file:
@@ -268,8 +288,8 @@ def assign_velocities(
         comparison = _compare_with_derivative(logs, column, position, joint)
         unit = _confirm_unit(comparison, column, joint)
         candidate = _Candidate(column, joint, placement, position, comparison, unit)
-        kinds.setdefault(candidate.kind, []).append(candidate)
-    for candidates in kinds.values():
+        candidates_by_kind.setdefault(candidate.kind, []).append(candidate)
+    for candidates in candidates_by_kind.values():
         _assign_kind(candidates, signals, result)
 
 
@@ -278,23 +298,30 @@ def _compare_with_derivative(
 ) -> VelocityComparison | None:
     """Compare a velocity column with the derivative of its joint's position, over the first runs.
 
-    Return None if no run has enough motion for a comparison.
+    At most `MAX_RUNS` runs are read. The velocity stays in the unit of its column, which is not
+    known yet; the position is in rad or m.
 
     Args:
         logs: files of the runs.
         column: velocity column.
         position: position signal of the joint.
         joint: joint of the robot.
+
+    Returns:
+        The comparison; None if no run has enough motion for it.
     """
     runs = []
     for name in list(logs.runs)[:MAX_RUNS]:
-        velocities, positions = logs.read(name, column), logs.read(name, position.column)
-        if velocities is None or positions is None:
+        velocity_samples = logs.read(name, column)
+        position_samples = logs.read(name, position.column)
+        if velocity_samples is None or position_samples is None:
             continue
-        seconds, values = velocities
-        is_new = np.diff(seconds, prepend=-np.inf) > 0
-        angles = position.convert(joint.unit, positions[1])
-        channels = {"q": angles[is_new], "v": values[is_new]}
+        # Both columns are in the same file, so they share their time stamps.
+        seconds, velocities = velocity_samples
+        _, recorded_positions = position_samples
+        positions = position.convert(joint.unit, recorded_positions)
+        is_new = np.diff(seconds, prepend=-np.inf) > 0  # not a repeated stamp
+        channels = {"q": positions[is_new], "v": velocities[is_new]}
         runs.append(Run(name, seconds[is_new], channels, {}, {}, {}, False))
     return VelocityComparison.measure(runs, "q", "v")
 
@@ -302,18 +329,23 @@ def _compare_with_derivative(
 def _confirm_unit(comparison: VelocityComparison | None, column: LogColumn, joint: Joint) -> str:
     """Return the unit in which a velocity is its position's derivative; empty if there is none.
 
+    The unit of the column is tried first, then the usual ones. A unit is confirmed if its factor to
+    rad/s or m/s is about the slope of the position's changes against the integrated velocity.
+
     Args:
-        comparison: comparison with the position's derivative; None if there is none.
+        comparison: comparison with the position's derivative; None if the joint hardly moves.
         column: column of the log.
         joint: joint of the robot.
     """
     if comparison is None or comparison.correlation < MIN_CORRELATION:
         return ""
-    si = f"{joint.unit}/s"
-    stated_units = [column.unit] if is_convertible(column.unit, si) else []
-    for unit in (*stated_units, *VELOCITY_UNITS["hinge" if joint.kind == "hinge" else "slide"]):
-        gain = compute_unit_scale(unit, si).gain
-        if SLOPE_RANGE[0] < gain / comparison.slope < SLOPE_RANGE[1]:
+    si_unit = f"{joint.unit}/s"
+    stated_units = [column.unit] if is_convertible(column.unit, si_unit) else []
+    usual_units = VELOCITY_UNITS["hinge" if joint.kind == "hinge" else "slide"]
+    min_ratio, max_ratio = SLOPE_RANGE
+    for unit in (*stated_units, *usual_units):
+        factor = compute_unit_scale(unit, si_unit).gain
+        if min_ratio < factor / comparison.slope < max_ratio:
             return unit
     return ""
 
@@ -323,12 +355,13 @@ def _assign_kind(
 ) -> None:
     """Assign velocity columns of one kind that agree with the derivative of their position.
 
-    All are left out if the velocities lag behind the positions, or are ahead of them. A joint that
-    hardly moves gets the unit of the others. Each column that is left out is reported with the
-    reason.
+    Columns of one kind have names that differ by joint or number only, and so share a unit and a
+    filter. All are left out if the velocities lag behind the positions, or are ahead of them. A
+    joint that hardly moves gets the unit of the others. Each column that is left out is reported
+    with the reason.
 
     Args:
-        candidates: columns of one kind, which share a unit and a filter.
+        candidates: columns of one kind.
         signals: assignment to which they are added.
         result: result of the import, to which messages are added.
     """
@@ -385,7 +418,8 @@ class ColumnAssigner:
     ) -> None:
         """Store the inputs; nothing is assigned yet.
 
-        `normalised` is set later if the log has positions as shares of a joint's range.
+        `normalised` is set by `assign_positions` if positions are normalised to the ranges of their
+        joints.
 
         Args:
             logs: Logs that are imported.
@@ -405,6 +439,8 @@ class ColumnAssigner:
 
     def assign_positions(self) -> None:
         """Assign the positions of the joints.
+
+        Columns whose names show no role are tried, too.
 
         Raises:
             InputError: No column is a joint's position.
@@ -426,15 +462,18 @@ class ColumnAssigner:
             )
 
     def _find_normalised(self, columns: Sequence[LogColumn]) -> None:
-        """Decide whether positions are shares of the joint ranges, as LeRobot records them.
+        """Decide whether positions are normalised to the joint ranges, as LeRobot records them.
 
-        If it cannot be decided, the user is asked to check.
+        The result is stored in `normalised`. If it cannot be decided, the user is asked to check.
+
+        Args:
+            columns: Columns without a unit that may be positions.
         """
         assignments = [(column, joint) for column, joint, _ in self._signals.place_columns(columns)]
         if not assignments:
             return
         path, options = self._logs.first_path, self._options
-        # An episode has one log; other runs may contain larger positions than the first.
+        # Other runs may contain larger positions than the first, which the columns hold.
         largest = max(
             float(np.nanmax(np.abs(values), initial=0.0))
             for column, _ in assignments
@@ -465,14 +504,17 @@ class ColumnAssigner:
     ) -> Signal | None:
         """Determine the unit of a position or a position command, and make its signal.
 
-        The unit is the first of these: the one that the log states; that of normalised positions;
-        the one that the user states; the one that fits the range of the joint. Return None, with a
-        message, if there is no such unit.
+        The unit is the first of these: the one that the log states; that to which normalised
+        positions are converted; for a hinge, the one that the user states; the one in which the
+        values fit the range of the joint.
 
         Args:
             column: column of the log.
             joint: joint of the robot.
             placement: reason for assigning the column to its joint.
+
+        Returns:
+            The signal; None, with a message, if no unit is known.
         """
         if column.unit:
             if not is_convertible(column.unit, joint.unit):
@@ -509,13 +551,16 @@ class ColumnAssigner:
     def _add_signal(
         self, table: dict[str, Signal], name: str, column: LogColumn, signal: Signal | None
     ) -> bool:
-        """Add a signal unless one with this name exists; return whether it was added.
+        """Add a signal unless one with this name exists, which is reported.
 
         Args:
             table: channels or inputs of the assignment, extended in place.
             name: name of the signal.
             column: its column.
-            signal: the signal; None to report only that the name is in use.
+            signal: the signal; None if its unit is not known, so that there is nothing to add.
+
+        Returns:
+            Whether the signal was added.
         """
         if name in table:
             self._result.leave_out(column, f"{name} is {table[name].column.name} already")
@@ -544,7 +589,10 @@ class ColumnAssigner:
                 self._assign_undriven(column, joint, placement)
 
     def _assign_undriven(self, column: LogColumn, joint: Joint, placement: Placement) -> None:
-        """Assign a command of a joint that the model does not drive: a servo or a force.
+        """Assign a command of a joint in a model without actuators.
+
+        A force or torque becomes a force on the joint, and a position, or an unknown quantity, the
+        command of a position servo that is added. Other commands are left out.
 
         Args:
             column: column of the log.
@@ -569,8 +617,9 @@ class ColumnAssigner:
     ) -> None:
         """Assign a column as command of an actuator, or report that the quantity is wrong.
 
-        A motor takes a torque or force, a servo a position or velocity. A column for a motor that
-        does not state its quantity is taken as a position if it looks like the recorded positions.
+        A motor takes a torque or force, a servo a position or velocity. If names and unit do not
+        show the quantity of the column, it is the one that the actuator takes; but a column for a
+        motor that is close to the recorded position is a desired position.
 
         Args:
             column: column of the log.
@@ -578,25 +627,21 @@ class ColumnAssigner:
             placement: reason for assigning the column to its joint.
             actuator: actuator that receives the command.
         """
-        given_quantity = column_guessing.get_commanded_role(column)
+        quantity = column_guessing.get_commanded_role(column)
         expected = COMMAND_QUANTITIES.get(actuator.kind)
         if (
             actuator.kind == "motor"
-            and given_quantity is None
+            and quantity is None
             and self._resembles_position(column, joint)
         ):
-            given_quantity = "position"
+            quantity = "position"
         name = f"u.{actuator.name}"
-        if expected is not None and given_quantity is not None and given_quantity != expected:
-            force_name = "torque" if joint.kind == "hinge" else "force"
-            given_name, expected_name = (
-                force_name if quantity == "force" else quantity
-                for quantity in (given_quantity, expected)
-            )
+        if expected is not None and quantity is not None and quantity != expected:
+            words = {"force": "torque"} if joint.kind == "hinge" else {}
             self._result.leave_out(
                 column,
-                f"is a desired {given_name} of {joint.name}, and {actuator.name} takes a "
-                f"{expected_name}",
+                f"is a desired {words.get(quantity, quantity)} of {joint.name}, and "
+                f"{actuator.name} takes a {words.get(expected, expected)}",
             )
         elif actuator.kind == "motor":
             self._assign_force(column, joint, name, placement)
@@ -610,7 +655,7 @@ class ColumnAssigner:
             self._add_signal(self._signals.inputs, name, column, signal)
 
     def _resembles_position(self, column: LogColumn, joint: Joint) -> bool:
-        """Return whether a command is close to the position, and so a desired position.
+        """Return whether a command is close to the joint's position, and so a desired position.
 
         Args:
             column: column of the command.
@@ -634,14 +679,15 @@ class ColumnAssigner:
     def _assign_force(
         self, column: LogColumn, joint: Joint, name: str, placement: Placement, origin: str = ""
     ) -> None:
-        """Assign the torque of a motor, or a force along a joint.
+        """Assign a column to an input that is a torque or force, unless its unit is wrong.
 
         Args:
             column: column of the log.
-            joint: joint along which the force acts.
-            name: name of the input.
+            joint: joint on which it acts.
+            name: name of the input: that of a motor, or a force on the joint.
             placement: reason for the joint.
-            origin: reason for the meaning, in words.
+            origin: text of a message, why a measured column is used as an input; empty for a
+                command.
         """
         unit = column.unit or joint.force_unit
         if not is_convertible(unit, joint.force_unit):
@@ -661,8 +707,9 @@ class ColumnAssigner:
         """
         signals = self._signals
         columns = [column for column in self._select_by_role("force") if _is_torque(column)]
-        torques: dict[str, list[tuple[LogColumn, Joint, Placement]]] = {}
-        for column, joint, placement in signals.place_columns(columns):
+        torques: dict[str, list[PlacedColumn]] = {}
+        for placed in signals.place_columns(columns):
+            joint = placed.joint
             actuator = signals.get_actuator(joint.name)
             if actuator is not None and actuator.kind == "motor":
                 name = f"u.{actuator.name}"
@@ -671,20 +718,24 @@ class ColumnAssigner:
             else:
                 continue
             if name not in signals.inputs:
-                torques.setdefault(name, []).append((column, joint, placement))
+                torques.setdefault(name, []).append(placed)
         for name, candidates in torques.items():
-            measured = [c for c in candidates if column_guessing.is_measured(c[0])]
-            # A log may also contain a controller's desired torque and a friction estimate.
-            if len(candidates) > 1 and len(measured) != 1:
+            if len(candidates) > 1:
+                # A log may also contain a controller's desired torque and a friction estimate.
+                candidates = [c for c in candidates if column_guessing.is_measured(c.column)]
+            if len(candidates) != 1:
                 continue
-            ((column, joint, placement),) = measured if len(candidates) > 1 else candidates
+            ((column, joint, placement),) = candidates
             origin = ", measured, because no column has its command"
             self._assign_force(column, joint, name, placement, origin)
 
     # -- other columns
 
     def find_switches(self) -> None:
-        """Keep the columns of zeros and ones that change: one may say when a drive is on."""
+        """Find the columns of zeros and ones that change: one may say when a drive is on.
+
+        They become extra columns of the recording.
+        """
         for column in self._select_by_role("other", "command"):
             if self._is_used(column) or self._result.is_left_out(column):
                 continue
@@ -699,7 +750,8 @@ class ColumnAssigner:
     def report_missing_inputs(self) -> None:
         """Report actuators without a command column, and columns that may be the command.
 
-        Nothing is reported if every actuator has a command.
+        A model without actuators and without inputs is reported, too. Nothing is reported if every
+        actuator has a command.
         """
         signals = self._signals
         undriven_actuators = [

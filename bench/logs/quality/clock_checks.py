@@ -70,31 +70,33 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
     Args:
         recording: Recording with the time stamps of each run.
     """
-    jittered, jitters, lost_count, sample_count, lossy = [], [], 0, 0, []
+    jitters: list[float] = []
+    lost_count, sample_count = 0, 0
+    runs_with_jitter, runs_with_losses = [], []
     for run in recording.runs:
         times = _select_timestamps(run)
         if times.size < 3:
             continue
         steps, lost = np.diff(times), find_lost_samples(times)
-        jitter, run_lost_count = lost.jitter, int(lost.counts.sum())
-        jitters.append(jitter)
-        if jitter > JITTER_THRESHOLD:
-            jittered.append(run.name)
+        jitters.append(lost.jitter)
+        if lost.jitter > JITTER_THRESHOLD:
+            runs_with_jitter.append(run.name)
         # If the clock jitters strongly, a long interval means a lost sample only if no short
-        # interval compensates for it.
+        # interval compensates for it: the duration of the run limits the number of lost samples.
         expected_count = int(steps.sum() / np.median(steps))
-        run_lost_count = min(run_lost_count, max(expected_count - steps.size, 0))
-        if run_lost_count < SIGNIFICANCE_SIGMAS * jitter * steps.size**0.5:
+        run_lost_count = min(int(lost.counts.sum()), max(expected_count - steps.size, 0))
+        # The jitter of all intervals adds up to this error of the duration, in samples.
+        if run_lost_count < SIGNIFICANCE_SIGMAS * lost.jitter * steps.size**0.5:
             run_lost_count = 0
         lost_count += run_lost_count
         sample_count += steps.size + run_lost_count
         if run_lost_count:
-            lossy.append(run.name)
-    if jittered:
+            runs_with_losses.append(run.name)
+    if runs_with_jitter:
         yield QualityFinding(
             "clock",
             f"intervals vary by {max(jitters):.0%} of one (1 sigma) in "
-            f"{join_first_names(jittered)}",
+            f"{join_first_names(runs_with_jitter)}",
             "every sample is simulated at its own stamp, so use the times of measurement as "
             "stamps, not the times of writing",
         )
@@ -102,7 +104,7 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
         yield QualityFinding(
             "clock",
             f"{lost_count} samples ({lost_count / sample_count:.1%}) are lost in "
-            f"{join_first_names(lossy)}",
+            f"{join_first_names(runs_with_losses)}",
             "readings are not interpolated; commands of a robot of up to "
             f"{MAX_FILLED_SAMPLES} lost samples are, unless they were held: log commands in a "
             "separate file if they jump",
@@ -110,11 +112,15 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
 
 
 def _select_timestamps(run: Run) -> Array:
-    """Return the sample times of the sensor that was read most often.
+    """Return the times at which the sensors of a run were read.
 
-    The sample times of a run also contain those of commands and of other sensors, which have their
-    own clocks. All sample times are returned if they are at least as regular: then the sensors
-    share one clock, and the samples that a sensor lacks are empty cells.
+    The sample times of a run also contain those of commands and of other sensors, which may have
+    their own clocks. There are two cases:
+
+    * All sample times are at least as regular as those of the sensor that was read most often: then
+      the sensors share one clock, and the samples that a sensor lacks are empty cells. All sample
+      times are returned.
+    * Otherwise, those of the sensor that was read most often are returned.
     """
     recorded_masks = [np.isfinite(values) for values in run.channels.values()]
     is_recorded = max(
@@ -138,7 +144,8 @@ def _compute_uneven_share(times: Array) -> float:
 def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
     """Find samples that repeat the previous one in every channel although the system moves.
 
-    Such samples were not measured anew, and look like a delay.
+    Such samples were not measured anew, and look like a delay. A run counts if it has significantly
+    more of them than its quantisation causes by coincidence.
     """
     repeated_count, sample_count, runs = 0, 0, []
     for run in recording.runs:
@@ -159,8 +166,8 @@ def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
 def _count_stale_samples(run: Run) -> tuple[int, float]:
     """Count samples that repeat the previous one in every channel although the system moves fast.
 
-    The system moves fast at a sample if some channel changes by many quantisation steps directly
-    before or after it. Such a repetition is rarely a coincidence.
+    The system moves fast at a sample if some channel changes by at least `FAST_SIGNAL_STEPS`
+    quantisation steps directly before or after it. Such a repetition is rarely a coincidence.
 
     Returns:
         The count, and the count to expect by coincidence, from the noise alone. It is estimated
@@ -170,25 +177,30 @@ def _count_stale_samples(run: Run) -> tuple[int, float]:
     signals = [values for values in run.channels.values() if np.isfinite(values).sum() > 3]
     if not signals or run.times.size < 4:
         return 0, 0.0
+    # (N, T - 1) changes of the channels; NaN where a sample is missing.
     changes = np.array([_count_quantisation_steps(values) for values in signals])
-    is_unchanged = np.nan_to_num(changes, nan=0.0) == 0
     neighbour_changes = np.maximum(np.abs(changes[:, :-2]), np.abs(changes[:, 2:]))
-    moving = (
+    is_moving = (
         np.nan_to_num(np.max(neighbour_changes, axis=0, initial=0.0), nan=0.0) >= FAST_SIGNAL_STEPS
     )
-    is_stale = is_unchanged.all(axis=0)[1:-1] & moving
-    # A signal whose noise spans several steps repeats its value half as often as it changes by one
-    # step in either direction.
-    is_nearly_stale = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)[1:-1] & moving
+    # A missing sample may be a repetition, but does not count as a change by one step.
+    is_unchanged = (np.nan_to_num(changes, nan=0.0) == 0).all(axis=0)
+    is_stale = is_unchanged[1:-1] & is_moving
+    is_nearly_unchanged = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)
+    is_nearly_stale = is_nearly_unchanged[1:-1] & is_moving
+    # Of the changes by one step at most, one in 3^N is a repetition: 1 / (3^N - 1) of the others.
     one_step_count = int(is_nearly_stale.sum()) - int(is_stale.sum())
     return int(is_stale.sum()), one_step_count / max(3.0 ** len(signals) - 1.0, 1.0)
 
 
 def _count_quantisation_steps(values: Array) -> Array:
-    """Return the (T - 1,) changes of a signal in units of its smallest change.
+    """Return the (T - 1,) changes of a signal in units of its smallest change, rounded.
+
+    The smallest change of a quantised signal is its quantisation step. Changes by rounding errors
+    do not count.
 
     Args:
-        values: (T,) samples.
+        values: (T,) samples, NaN where missing.
     """
     changes = np.diff(values)
     sizes = np.abs(changes[np.isfinite(changes)])
@@ -239,12 +251,12 @@ def _check_gap(run: Run) -> Anomaly | None:
     Such a run probably consists of two. Return None if there is no such gap.
     """
     intervals = np.diff(run.times)
-    place = int(intervals.argmax())
-    gap = float(intervals[place])
+    longest = int(intervals.argmax())
+    gap = float(intervals[longest])
     sampled_seconds = float(intervals.sum()) - gap
     if gap <= MAX_GAP_RATIO * sampled_seconds:
         return None
-    gap_text = f"{gap:.4g} s without a sample from t = {run.times[place]:.6g} s on"
+    gap_text = f"{gap:.4g} s without a sample from t = {run.times[longest]:.6g} s on"
     sampled_text = f"in a run that has samples for {sampled_seconds:.4g} s"
     return Anomaly(
         f"run {run.name}: {gap_text}, {sampled_text}; split it there into two runs", True
@@ -252,14 +264,20 @@ def _check_gap(run: Run) -> Anomaly | None:
 
 
 def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | None:
-    """Find a run in which every coordinate moves far more slowly or far faster than expected.
+    """Find time stamps in a wrong unit: every coordinate moves far too slowly or far too fast.
 
-    This finds time stamps in a wrong unit. Each recorded coordinate is compared: its time of motion
-    in the recording with the time that its forces would need. The anomaly is certain (it stops the
-    program) only for motion that is too slow even for a driven system.
+    For each recorded coordinate, the time in which it moves in the recording is compared with the
+    time that its own forces would need. There are three cases:
 
-    All coordinates share the stamps, so a coordinate that moves as expected clears them; another
-    one may belong to a link without inertia in the model file.
+    * Far too fast: an anomaly that is not certain.
+    * Far too slow, and the sampling interval exceeds the expected time, for a robot with inputs by
+      `DRIVEN_SYSTEM_FACTOR`: an anomaly. It is certain, so that it stops the program, if there are
+      no inputs, or the interval exceeds the expected time by that factor.
+    * Otherwise the time stamps are right. All coordinates share them, so nothing is reported even
+      if another coordinate is too slow or too fast; it may belong to a link without inertia in the
+      model file.
+
+    The anomaly of the first coordinate is returned, or None.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -278,7 +296,7 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     # A servo holds its position by force, so large forces at rest are normal.
     is_driven = kind.has_model and _has_inputs(run)
     typical_sizes = {channel.name: channel.scale for channel in system.channels}
-    doubtful: Anomaly | None = None
+    first_anomaly: Anomaly | None = None
     for column, name in enumerate(system.coordinates):
         values = run.channels.get(name)
         if values is None:
@@ -294,32 +312,31 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
                 f"{name} moves in {recorded_seconds:.3g} s as {kind.name} would within "
                 f"{expected_seconds:.2g} s"
             )
-            doubtful = doubtful or Anomaly(
+            first_anomaly = first_anomaly or Anomaly(
                 f"run {run.name}: {moves}; are the stamps seconds?", False
             )
             continue
-        if ratio < TIME_UNIT_RATIO_THRESHOLD or interval < (
-            DRIVEN_SYSTEM_FACTOR * expected_seconds if is_driven else expected_seconds
-        ):
+        min_interval = (DRIVEN_SYSTEM_FACTOR if is_driven else 1.0) * expected_seconds
+        if ratio < TIME_UNIT_RATIO_THRESHOLD or interval < min_interval:
             return None
-        unit = min(_TIME_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
+        divisor = min(_TIME_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
         moves = (
             f"{name} takes {recorded_seconds:.3g} s to move as {kind.name} would within "
             f"{expected_seconds:.2g} s"
         )
         interval_text = f"samples lie {interval:.3g} s apart"
-        remedy = f"are the stamps {_TIME_UNITS[unit]}? then divide t by {unit:g}"
-        certain = not _has_inputs(run) or interval >= DRIVEN_SYSTEM_FACTOR * expected_seconds
-        doubtful = doubtful or Anomaly(
-            f"run {run.name}: {moves}, and {interval_text}; {remedy}", certain
+        remedy = f"are the stamps {_TIME_UNITS[divisor]}? then divide t by {divisor:g}"
+        is_certain = not _has_inputs(run) or interval >= DRIVEN_SYSTEM_FACTOR * expected_seconds
+        first_anomaly = first_anomaly or Anomaly(
+            f"run {run.name}: {moves}, and {interval_text}; {remedy}", is_certain
         )
-    return doubtful
+    return first_anomaly
 
 
 def _compute_free_motion_time(
     values: Array, accelerations: Array, min_spread: float
 ) -> float | None:
-    """Return the time in which its own forces would move a coordinate as far as in the recording.
+    """Return the time in s in which its own forces would move a coordinate as far as recorded.
 
     It is T' = (var x / mean a^2)^(1/4) (2), with the acceleration a that the forces cause at rest
     in the recorded positions x; None if the coordinate hardly moves, or no force acts.
@@ -375,11 +392,14 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
 
 
 def _estimate_lag(x: Array) -> float:
-    """Return the shortest lag in samples after which values differ by their spread (1).
+    """Estimate the shortest lag in samples after which values differ by their spread.
 
     It is the smallest T with mean (x(t + T) - x(t))^2 >= var x (1). Lags 1, 2, 4, ... are tried,
     and the last one below T is returned, so that the motion never seems slower than it is. It is 0
     if values differ as much from one sample to the next.
+
+    Args:
+        x: (T,) signal, NaN where missing.
     """
     variance = float(np.nanvar(x))
     lag, previous_lag = 1, 0
@@ -473,7 +493,10 @@ def check_clock_drift(recording: Recording, kind: type[Simulator]) -> Iterator[Q
 
 
 def _list_driven_positions(kind: type[Simulator]) -> list[tuple[str, str]]:
-    """Return pairs of an input and a position that it drives, by channel name."""
+    """Return pairs of names: an input, and the channel of a position that it may drive.
+
+    For a robot, it is the position of the actuator's joint; for other systems, each coordinate.
+    """
     if not issubclass(kind, SystemSimulator):
         return []
     if kind.has_model:
@@ -483,15 +506,16 @@ def _list_driven_positions(kind: type[Simulator]) -> list[tuple[str, str]]:
 
 
 def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Estimate]:
-    """Estimate the drift of the sensors' clock against the commands' clock in one run, by eq. (2).
+    """Estimate the drift of the sensors' clock against the commands' clock in one run.
 
-    The position is predicted by means of past commands, eq. (1). A drift makes the delay grow with
-    time t, so that the error of the prediction has a part proportional to t times the velocity; the
-    drift is its factor, by least squares. Nothing is yielded if the run is short, or the commands
-    explain too little of the motion; otherwise one estimate.
+    1. The position is predicted from past commands, p(t) = c + d t + sum_k h_k <u>_k(t) (1), where
+       <u>_k is the mean command over the k-th interval before t.
+    2. A delay T that grows by a share e of the time, the drift, gives y(t) = p - (T + e t) p' to
+       first order (2). So e is estimated by least squares from the part of y that is proportional
+       to t times the velocity p'.
 
-    The response to commands is p(t) = c + d t + sum_k h_k <u>_k(t) (1); a delay T that grows by a
-    share e of the time gives y(t) = p - (T + e t) p' to first order (2).
+    Nothing is yielded if the run is short, or the commands explain too little of the motion;
+    otherwise one estimate.
 
     Args:
         run: Run with its times, inputs and channels.
@@ -506,6 +530,7 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     grid = np.arange(t[0], t[-1], step)
     positions = np.interp(grid, t[is_recorded], y[is_recorded])
     past_command_means = _average_over_intervals(np.interp(grid, t, u))
+    # Samples for which all intervals lie within the run.
     fitted_part = slice(LAG_BIN_EDGES[-1], len(grid) + LAG_BIN_EDGES[0])
     time = (grid - grid.mean())[fitted_part]
     positions, past_command_means = positions[fitted_part], past_command_means[fitted_part]
@@ -527,6 +552,8 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
         return
     drift = float(delay_response @ positions) / response_power
     residual = positions - basis @ (basis.T @ positions) - drift * delay_response
+    # The residual is autocorrelated, but hardly over more than the memory of (1): sums over blocks
+    # of that length are independent, and their scatter gives the standard error.
     block_sums = np.add.reduceat(
         delay_response * residual, np.arange(0, time.size, LAG_BIN_EDGES[-1])
     )
@@ -539,25 +566,30 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
 
 
 def _average_over_intervals(command: Array) -> Array:
-    """Return the (N, K) means of a command over the intervals of equation (1).
+    """Return the means of a command over K intervals before each of its N samples.
 
-    The N samples have K intervals before them, whose ends are `LAG_BIN_EDGES` samples earlier;
-    means are differences of the cumulative sum.
+    The ends of the intervals are `LAG_BIN_EDGES` samples before the sample; the first ones are
+    negative, which is after it. Beyond the ends of the command, it counts as zero.
 
     Args:
         command: (N,) samples of the command.
+
+    Returns:
+        (N, K) means.
     """
     cumulative_sum = np.concatenate([[0.0], np.cumsum(command)])
     samples = np.arange(command.size)
     columns = []
-    for begin, end in pairwise(LAG_BIN_EDGES):
-        first, last = (np.clip(samples - bound + 1, 0, command.size) for bound in (end, begin))
-        columns.append((cumulative_sum[last] - cumulative_sum[first]) / (end - begin))
+    for shortest_lag, longest_lag in pairwise(LAG_BIN_EDGES):
+        # The sum over an interval is the difference of the cumulative sum at its ends.
+        first = np.clip(samples - longest_lag + 1, 0, command.size)
+        end = np.clip(samples - shortest_lag + 1, 0, command.size)
+        columns.append((cumulative_sum[end] - cumulative_sum[first]) / (longest_lag - shortest_lag))
     return np.column_stack(columns)
 
 
 def _pool_estimates(estimates: list[_Estimate]) -> _Estimate:
-    """Return the mean, weighted by inverse variances, with an error that admits too much scatter.
+    """Return the mean of estimates weighted by their inverse variances, and its standard error.
 
     If estimates scatter more than their errors allow, these are too small: the error is multiplied
     by the ratio of both (the square root of the reduced chi-squared, known as Birge ratio).
@@ -570,6 +602,6 @@ def _pool_estimates(estimates: list[_Estimate]) -> _Estimate:
     drift = float(weights @ drifts / weights.sum())
     error = float(weights.sum() ** -0.5)
     if len(estimates) > 1:
-        scatter = float(weights @ (drifts - drift) ** 2) / (len(estimates) - 1)
-        error *= max(scatter, 1.0) ** 0.5
+        reduced_chi_squared = float(weights @ (drifts - drift) ** 2) / (len(estimates) - 1)
+        error *= max(reduced_chi_squared, 1.0) ** 0.5
     return _Estimate(drift, error)

@@ -34,17 +34,17 @@ class NoiseEstimate(NamedTuple):
 
 
 def estimate_noise(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
-    """Estimate noise from the residuals of samples against a line or parabola through neighbours.
+    """Estimate white noise of a signal from its second and third differences.
 
-    For uniform sampling these are second and third differences (von Neumann et al., Ann. Math.
-    Stat. 12, 153, 1941, doi:10.1214/aoms/1177731746), made robust by their median and generalised
-    to non-uniform sampling by divided differences
+    The differences are the residuals of samples against a line or parabola through their neighbours
+    (von Neumann et al., Ann. Math. Stat. 12, 153, 1941, doi:10.1214/aoms/1177731746). They are made
+    robust by their median, and generalised to non-uniform sampling by divided differences
 
         d = sum_i w_i y_i,  w_i ~ 1 / prod_(j != i) (t_i - t_j),  sum_i w_i^2 = 1       (1)
 
-    The smaller of the two estimates is used, since residual motion only increases them. The method
-    assumes white noise: autocorrelated noise is underestimated, and motion that is fast relative to
-    the sampling looks like noise. A quantised signal has at least its rounding noise.
+    The smaller of the two estimates is used, since residual motion only increases them.
+    Autocorrelated noise is underestimated, and motion that is fast relative to the sampling looks
+    like noise. A quantised signal has at least its rounding noise.
 
     Args:
         signals: (times (T,), values (T,)) of each run; NaN values are missing.
@@ -63,9 +63,10 @@ def estimate_noise(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
 
 
 def estimate_differences_sigma(signals: Iterable[tuple[Array, Array]], order: int) -> float:
-    """Estimate white noise (1 sigma) from divided differences (1) of one order, over all runs.
+    """Estimate white noise (1 sigma) from divided differences of one order, over all runs.
 
-    The higher the order, the less a smooth motion contributes.
+    A difference of order n is the residual of a sample against a polynomial of degree n - 1 through
+    n neighbours. The higher the order, the less a smooth motion contributes.
 
     Args:
         signals: (times (T,), values (T,)) of each run; NaN values are missing.
@@ -84,9 +85,11 @@ def estimate_differences_sigma(signals: Iterable[tuple[Array, Array]], order: in
 
 
 def _compute_divided_differences(times: Array, values: Array, order: int) -> Array:
-    """Compute differences of the given order, eq. (1): smooth motion cancels, noise stays.
+    """Compute divided differences of samples: smooth motion cancels, noise stays.
 
-    They are scaled so that white noise keeps its variance. Differences across a gap are left out.
+    With windows of order + 1 samples y_i at the times t_i, they are d = sum_i w_i y_i with
+    w_i ~ 1 / prod_(j != i) (t_i - t_j), scaled by sum_i w_i^2 = 1 so that white noise keeps its
+    variance (1). Windows across a gap are left out.
 
     Args:
         times: (T,) times, s.
@@ -99,7 +102,6 @@ def _compute_divided_differences(times: Array, values: Array, order: int) -> Arr
     t, y = t[is_gapless], y[is_gapless]
     # (windows, order + 1, order + 1); ones on the diagonal instead of the factors t_i - t_i = 0.
     time_differences = t[:, :, None] - t[:, None, :] + np.eye(order + 1)
-    # Equation (1): a polynomial of lower order becomes zero, white noise keeps its variance.
     weights = 1.0 / time_differences.prod(axis=2)
     weights /= np.sqrt((weights * weights).sum(axis=1, keepdims=True))
     differences: Array = (weights * y).sum(axis=1)

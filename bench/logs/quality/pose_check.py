@@ -45,7 +45,11 @@ def find_contacts(
 def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
     """Compute accelerations of a robot at rest in recorded positions under recorded commands.
 
-    They show how fast the robot could move, see `clock_checks`.
+    They show how fast the robot could move, by which time stamps in a wrong unit are found.
+
+    Args:
+        run: Run of the robot.
+        kind: Simulator class of the robot.
 
     Returns:
         (N, D) accelerations of the D joints with one coordinate, at N times of the run, at most
@@ -69,6 +73,11 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
 
     Joints that are not recorded keep their initial position. Contacts that cannot act on a recorded
     joint, such as those of an object that rests on a table next to the robot, are left out.
+    Held-out runs are not used.
+
+    Args:
+        recording: Recording of the robot.
+        kind: Simulator class of the robot.
 
     Returns:
         Names of at most `MAX_CONTACTS` pairs, the most frequent ones, in alphabetical order.
@@ -79,19 +88,24 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
     model = kind.robot.compiled  # type: ignore[attr-defined]
     if not _can_touch(model):
         return ()
+    # Number of poses in which a pair of geoms touches.
     counts = Counter[tuple[int, int]]()
     for run in recording.training():
         for data in iterate_poses(kind, run.channels):
-            touching = data.contact.geom[: data.ncon][data.contact.dist[: data.ncon] <= 0.0]
-            counts.update({(int(min(pair)), int(max(pair))) for pair in touching})
+            is_touching = data.contact.dist[: data.ncon] <= 0.0
+            touching_geoms = data.contact.geom[: data.ncon][is_touching]
+            counts.update({(int(min(pair)), int(max(pair))) for pair in touching_geoms})
+    # Kinematic trees (bodies connected by joints) in which some joint is recorded.
     recorded_trees = {
         int(model.dof_treeid[joint.velocity])
         for run in recording.training()
         for joint in kind.robot.joints  # type: ignore[attr-defined]
         if f"q.{joint.name}" in run.channels
     }
-    acting = Counter({p: counts[p] for p in _select_acting_pairs(model, counts, recorded_trees)})
-    frequent_pairs = acting.most_common(MAX_CONTACTS)
+    acting_pairs = _select_acting_pairs(model, counts, recorded_trees)
+    frequent_pairs = Counter({pair: counts[pair] for pair in acting_pairs}).most_common(
+        MAX_CONTACTS
+    )
     return tuple(sorted({make_pair_name(model, pair) for pair, _ in frequent_pairs}))
 
 
@@ -138,11 +152,13 @@ def iterate_poses(
 ) -> Iterator[Any]:
     """Yield MuJoCo's data (mujoco.MjData) of a robot at rest at some of its recorded poses.
 
-    The same object is yielded each time, with up to `CHECKED_INSTANTS` poses one after another.
+    Up to `CHECKED_INSTANTS` poses are evaluated, evenly spaced over the samples. The same object is
+    yielded each time, with the contacts and accelerations of the next pose.
 
     Args:
         kind: simulator class of the robot.
-        positions: (T,) positions by channel ``q.JOINT``, rad or m.
+        positions: (T,) positions by channel ``q.JOINT``, rad or m; joints without one, and missing
+            samples, have the initial position.
         inputs: (T,) inputs by name; those that are missing are zero.
     """
     import mujoco
@@ -152,20 +168,20 @@ def iterate_poses(
     model = robot.compiled
     data = mujoco.MjData(model)
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
-    count = max((values.size for values in positions.values()), default=0)
-    rows = np.unique(np.linspace(0, max(count - 1, 0), CHECKED_INSTANTS).astype(np.intp))
+    sample_count = max((values.size for values in positions.values()), default=0)
+    samples = np.unique(np.linspace(0, max(sample_count - 1, 0), CHECKED_INSTANTS).astype(np.intp))
     with capture_mujoco_warnings():
-        for row in rows:
+        for sample in samples:
             mujoco.mj_resetData(model, data)
             for joint in joints:
                 values = positions.get(f"q.{joint.name}")
-                if values is not None and np.isfinite(values[row]):
-                    data.qpos[joint.position] = values[row]
+                if values is not None and np.isfinite(values[sample]):
+                    data.qpos[joint.position] = values[sample]
                 if f"force.{joint.name}" in inputs:
-                    data.qfrc_applied[joint.velocity] = inputs[f"force.{joint.name}"][row]
+                    data.qfrc_applied[joint.velocity] = inputs[f"force.{joint.name}"][sample]
             for actuator in robot.actuators:
                 if f"u.{actuator.name}" in inputs:
-                    data.ctrl[actuator.control] = inputs[f"u.{actuator.name}"][row]
+                    data.ctrl[actuator.control] = inputs[f"u.{actuator.name}"][sample]
             mujoco.mj_forward(model, data)
             yield data
 
@@ -180,7 +196,8 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
     """Find bodies of a robot that overlap in most of the recorded poses.
 
     Contact forces would then act all the time, which is not possible in a real robot: the shapes
-    in the model file are too large. A pair counts at most once in a pose, with its deepest contact.
+    in the model file are too large. A pair counts at most once in a pose, with its deepest contact,
+    and only if that is deeper than `MIN_OVERLAP_METRES`. Held-out runs are not used.
 
     Args:
         recording: Recording to check.
@@ -192,11 +209,12 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
     model = robot.compiled
     if not _can_touch(model):
         return
+    # Depth of the overlap in m in each pose with one, by the names of two bodies.
     depths: dict[tuple[str, str], list[float]] = {}
-    count = 0
+    pose_count = 0
     for run in recording.training():
         for data in iterate_poses(kind, run.channels):
-            count += 1
+            pose_count += 1
             deepest: dict[tuple[str, str], float] = {}
             for contact in data.contact[: data.ncon]:
                 bodies = [model.body(int(model.geom_bodyid[g])).name for g in contact.geom]
@@ -206,14 +224,15 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
                 if depth > MIN_OVERLAP_METRES:
                     depths.setdefault(pair, []).append(depth)
     for (body, other_body), values in depths.items():
-        if len(values) > MIN_OVERLAP_SHARE * count:
-            remedy = f'add <contact><exclude body1="{body}" body2="{other_body}"/></contact>'
+        if len(values) > MIN_OVERLAP_SHARE * pose_count:
             if robot.format == "urdf":
                 remedy = "make their collision shapes smaller"
+            else:
+                remedy = f'add <contact><exclude body1="{body}" body2="{other_body}"/></contact>'
             yield QualityFinding(
                 "overlap",
                 f"bodies {body} and {other_body} overlap by up to {1e3 * max(values):.3g} mm in "
-                f"{len(values) / count:.0%} of the recorded poses, so that a contact force "
+                f"{len(values) / pose_count:.0%} of the recorded poses, so that a contact force "
                 "always acts between them",
                 f"{remedy} in {robot.path.name}",
             )
@@ -223,7 +242,8 @@ def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iter
     """Find floating joints whose initial state is missing in some run.
 
     No sensor of a usual log shows where a free body begins, and the fit does not estimate it, so
-    the description must state it. Only the first run without the state is reported for each joint.
+    the description must state it, at least in part. Only the first run without any state of the
+    joint is reported.
 
     Args:
         recording: Recording to check.
@@ -234,23 +254,24 @@ def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iter
     """
     states_by_joint: dict[str, list[str]] = {}
     for name in get_floating_state_units(kind):
+        # The name of a state is that of its quantity, joint and coordinate: q.hull.x.
         joint = name.split(".", 1)[1].rpartition(".")[0]
         states_by_joint.setdefault(joint, []).append(name)
+    names = [run.name for run in recording.runs]
     for joint, states in states_by_joint.items():
-        incomplete_runs = (run for run in recording.runs if run.initial.keys().isdisjoint(states))
-        run = next(incomplete_runs, None)
+        runs_without_state = (
+            run for run in recording.runs if run.initial.keys().isdisjoint(states)
+        )
+        run = next(runs_without_state, None)
         if run is None:
             continue
-        names = [recorded_run.name for recorded_run in recording.runs]
-        if names.count(run.name) > 1:
+        if names.count(run.name) > 1:  # two parts of a single run
             missing_text = (
                 f"where {joint} is when the last third of a single run begins; record another"
             )
         else:
             missing_text = (
-                f"where {joint} begins; state [runs.{run.name}.initial], of {', '.join(states)}"
-            )
-            missing_text = (
-                f"{missing_text} (states that are left out are as in the model file, at rest)"
+                f"where {joint} begins; state [runs.{run.name}.initial], of {', '.join(states)} "
+                "(states that are left out are as in the model file, at rest)"
             )
         yield Anomaly(f"run {run.name}: the log does not state {missing_text}", True)

@@ -44,7 +44,7 @@ def check_quantisation(recording: Recording, kind: type[Simulator]) -> Iterator[
         One finding for each such channel.
     """
     for channel, signals in _iterate_channels(recording, kind):
-        step = estimate_noise(signals).step
+        step = estimate_noise(signals).step  # 0 without quantisation
         values = np.concatenate([values for _, values in signals])
         spread = float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() else 0.0
         stated_noise = recording.noise.get(channel.name)
@@ -83,6 +83,7 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
     """
     for channel, signals in _iterate_channels(recording, kind):
         for sign, word in ((1.0, "highest"), (-1.0, "lowest")):
+            # With a reversed sign, the lowest value is the highest one.
             values = [
                 sign * run_values for _, run_values in signals if np.isfinite(run_values).any()
             ]
@@ -184,7 +185,7 @@ def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
 def _iterate_channels(
     recording: Recording, kind: type[Simulator]
 ) -> Iterator[tuple[Channel, list[tuple[Array, Array]]]]:
-    """Yield each recorded channel with its times and values in every run.
+    """Yield each recorded channel with its times (T,) and values (T,) in every run.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -224,17 +225,23 @@ def _count_saturated_samples(values: Array, extreme: float, min_jump: float) -> 
     return int(lengths[(lengths >= MIN_SATURATED_SAMPLES) & (jumps > min_jump)].sum())
 
 
-def _is_resting_value(values: Array, end: float) -> bool:
-    """Return whether a run begins or ends at this value, or never takes it: it is at rest there."""
+def _is_resting_value(values: Array, extreme: float) -> bool:
+    """Return whether a run may rest at an extreme value: it begins or ends there, or never has it.
+
+    Args:
+        values: (T,) signal of the run, NaN where missing.
+        extreme: smallest or largest value of all runs.
+    """
     recorded_values = values[np.isfinite(values)]
-    return (
-        bool(recorded_values.size and (recorded_values[0] == end or recorded_values[-1] == end))
-        or not (values == end).any()
-    )
+    if not (recorded_values == extreme).any():
+        return True
+    return bool(recorded_values[0] == extreme or recorded_values[-1] == extreme)
 
 
 def _find_moving_windows(values: Array, min_motion: float) -> Array:
-    """Return for each window of a run whether the signal moves in it.
+    """Return for each window of `WINDOW_SAMPLES` samples of a run whether the signal moves in it.
+
+    A shorter run is one window. Windows without a sample are left out.
 
     Args:
         values: (T,) signal of the run, NaN where missing.
@@ -243,7 +250,7 @@ def _find_moving_windows(values: Array, min_motion: float) -> Array:
     count = values.size // WINDOW_SAMPLES
     if not count:
         return np.array([bool(np.nanmax(values) - np.nanmin(values) > min_motion)])
-    rows = values[: count * WINDOW_SAMPLES].reshape(count, WINDOW_SAMPLES)
-    rows = rows[np.isfinite(rows).any(axis=1)]
-    is_moving: Array = (np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)) > min_motion
+    windows = values[: count * WINDOW_SAMPLES].reshape(count, WINDOW_SAMPLES)
+    windows = windows[np.isfinite(windows).any(axis=1)]
+    is_moving: Array = (np.nanmax(windows, axis=1) - np.nanmin(windows, axis=1)) > min_motion
     return is_moving

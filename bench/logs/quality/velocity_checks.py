@@ -111,10 +111,10 @@ class VelocityComparison(NamedTuple):
 
     @staticmethod
     def measure(runs: Sequence[Run], position: str, rate: str) -> VelocityComparison | None:
-        """Compare a velocity with its position, where both have samples.
+        """Compare the integral of a velocity with the change of its position, over all runs.
 
         The runs are divided into intervals so long that the position changes well beyond its noise.
-        Intervals with a gap in time are left out.
+        Samples at which one of both is missing, and intervals with a gap in time, are left out.
 
         Args:
             runs: Runs with both channels.
@@ -135,13 +135,13 @@ class VelocityComparison(NamedTuple):
         rms_sample_change = compute_rms(sample_changes)
         if not rms_sample_change > 0:
             return None
-        # Long enough to exceed the noise, but no longer: over a whole oscillation both integrals
-        # vanish.
+        # Samples of an interval: enough to exceed the noise, but not more, since over a whole
+        # oscillation both the change and the integral vanish.
         required_length = np.ceil(MIN_POSITION_CHANGE_SIGMAS * sigma / rms_sample_change)
         length = int(np.clip(required_length, MIN_SEGMENT_SAMPLES, 50))
         integrated = [part.integrate(length, MAX_INTERVAL_RATIO * interval) for part in series]
-        dq, s, dv = (np.concatenate(rows) for rows in zip(*integrated, strict=True))
-        is_known = np.isfinite(s)
+        dq, s, dv = (np.concatenate(arrays) for arrays in zip(*integrated, strict=True))
+        is_known = np.isfinite(s)  # no gap in time
         dq, s, dv = dq[is_known], s[is_known], dv[is_known]
         if is_known.sum() < MIN_SEGMENTS or not (s @ s > 0 and dq @ dq > 0):
             return None
@@ -153,20 +153,15 @@ class VelocityComparison(NamedTuple):
     def pool(comparisons: Sequence[VelocityComparison]) -> VelocityComparison:
         """Join the comparisons of several joints to one, from which a common delay is estimated.
 
-        Each velocity is first multiplied by its slope, so that a wrong unit has no influence.
+        Each velocity is first multiplied by its slope, the factor from the integrated velocity to
+        the change of the position, so that a wrong unit has no influence.
         """
-        scaled = [
-            VelocityComparison(
-                comparison.position_changes,
-                comparison.slope * comparison.velocity_integrals,
-                comparison.slope * comparison.velocity_changes,
-                comparison.interval,
-            )
-            for comparison in comparisons
-        ]
-        interval = float(np.median([comparison.interval for comparison in scaled]))
-        dq, s, dv = (np.concatenate(rows) for rows in list(zip(*scaled, strict=True))[:3])
-        return VelocityComparison(dq, s, dv, interval)
+        return VelocityComparison(
+            np.concatenate([c.position_changes for c in comparisons]),
+            np.concatenate([c.slope * c.velocity_integrals for c in comparisons]),
+            np.concatenate([c.slope * c.velocity_changes for c in comparisons]),
+            float(np.median([c.interval for c in comparisons])),
+        )
 
     @property
     def slope(self) -> float:
@@ -185,11 +180,12 @@ class VelocityComparison(NamedTuple):
         return float(dq @ s) / float(np.sqrt((s @ s) * (dq @ dq)))
 
     def delay(self) -> VelocityDelay | None:
-        """Return the lag by equation (2), in units of the slope; None if it is not significant.
+        """Return the lag of the velocity behind the derivative of the position.
 
         It is T = -<(s - dq) dv> / <dv^2> (2), with changes dq of position, integrals s of velocity
-        and changes dv of velocity over intervals. It is significant if it is several standard
-        errors, and at least a fraction of a sampling interval.
+        and changes dv of velocity over intervals. The velocity is multiplied by its slope, so that
+        a wrong unit has no influence. The result is None if the lag is not significant, which means
+        several standard errors and a fraction of a sampling interval.
         """
         slope, dv = self.slope, self.velocity_changes
         difference = slope * self.velocity_integrals - self.position_changes
@@ -224,12 +220,16 @@ class _Series(NamedTuple):
     def integrate(self, length: int, max_gap: float) -> tuple[Array, Array, Array]:
         """Return dq, s and dv (see `VelocityComparison`) of intervals of `length` samples.
 
-        The velocity is integrated by the trapezoidal rule; s is NaN across a gap in time. The
-        samples after the last whole interval are not used.
+        The velocity is integrated by the trapezoidal rule. The samples after the last whole
+        interval are not used.
 
         Args:
             length: number of samples of an interval.
-            max_gap: longest step within an interval, s.
+            max_gap: longest time between two samples, s; across a longer one, s is NaN.
+
+        Returns:
+            Changes of position (N,), integrals of velocity (N,) and changes of velocity (N,) over
+            N intervals.
         """
         steps = np.diff(self.times)
         areas = 0.5 * (self.velocity[1:] + self.velocity[:-1]) * steps
@@ -247,8 +247,8 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
     """Yield a finding if a recorded velocity contradicts the change of its position.
 
     The changes of the position are compared with the integral of the velocity over the same
-    intervals. The tests follow each other: no correlation, a wrong sign, a wrong factor (such as a
-    unit), and a delay.
+    intervals. The first of these findings is reported: no correlation, a wrong sign, a wrong factor
+    (such as a unit), or a delay.
 
     Args:
         runs: Runs that contain both channels.
@@ -267,8 +267,8 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
             "is it of another joint? correct the columns, or leave it out",
         )
         return
-    # Noise of the velocity makes (1) too small, noise of the position makes its inverse too small:
-    # the true slope lies between.
+    # The slope of dq against s is too small due to noise of s, and the inverse of the slope of s
+    # against dq is too large due to noise of dq. The true slope lies between them.
     inverse_slope = float(dq @ dq) / float(dq @ s)
     residual = dq - slope * s
     error = float(np.sqrt(residual @ residual / max(dq.size - 1, 1) / (s @ s)))
