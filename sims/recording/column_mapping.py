@@ -43,16 +43,18 @@ class SignalSource(NamedTuple):
     weights: tuple[float, ...] = (1.0,)
 
     def combine(self, read_column: Callable[[str], Array]) -> Array:
-        """Return the signal (T,) in the unit of its columns.
+        """Return the weighted sum (T,) of the columns, in their unit.
 
         Args:
             read_column: Function that returns a column (T,) by name.
         """
-        first = read_column(self.columns[0])
+        first, *others = map(read_column, self.columns)
         if self.weights == (1.0,):
+            # A single column is returned without a copy.
             return first
-        weighted_columns = zip(self.columns[1:], self.weights[1:], strict=True)
-        return sum((w * read_column(name) for name, w in weighted_columns), self.weights[0] * first)
+        first_weight, *other_weights = self.weights
+        weighted_columns = (w * column for w, column in zip(other_weights, others, strict=True))
+        return sum(weighted_columns, first_weight * first)
 
 
 @dataclass(frozen=True)
@@ -95,15 +97,15 @@ def read_sources(
 ) -> RecordingSources:
     """Read from a description in which files and columns of the logs the signals are.
 
-    The table ``[time]`` states the stamps, each signal its file and columns, and ``[runs.NAME]``
-    the folder or file of a run. If nothing is stated, the table was written for simgap, and its
-    columns have the names of the signals.
+    The table ``[time]`` states the time stamps, each signal its file and columns, and
+    ``[runs.NAME]`` the folder or file of a run. If nothing is stated, the recording is a table in
+    the format of simgap, whose columns have the names of the signals.
 
     Args:
         path: Path of the description, for messages.
         meta: Content of the description.
-        columns: Table of each channel and input in the description.
-        extra: Table of each column that is neither.
+        columns: Entries of each channel and input in the description.
+        extra: Entries of each column that is neither.
 
     Raises:
         InputError: The description is malformed.
@@ -120,7 +122,7 @@ def read_sources(
     signals = {name: _read_source(path, name, table) for name, table in columns.items()}
     folders, run_files = {}, {}
     for name, run_table in get_subtable(path, meta, "runs").items():
-        if not isinstance(run_table, dict):
+        if not isinstance(run_table, dict):  # refused when the runs are read
             continue
         if "file" in run_table:
             run_files[name] = check_text(path, f"runs.{name}.file", run_table["file"])
@@ -129,8 +131,12 @@ def read_sources(
             folders[name] = check_text(path, f"runs.{name}.folder", run_table["folder"])
     tables = (*columns.values(), *extra.values())
     has_columns = any({"file", "column"} & table.keys() for table in tables)
-    has_files = any("file" in table for table in tables)
-    has_files = has_files or bool(folders) or bool({"column", "unit", "rate"} & time.keys())
+    # Tables in the format of simgap have neither files nor folders, nor another time than t in s.
+    has_files = (
+        any("file" in table for table in tables)
+        or bool(folders)
+        or bool({"column", "unit", "rate"} & time.keys())
+    )
     return RecordingSources(
         signals=signals,
         time=time_column,
@@ -182,11 +188,14 @@ def _read_source(path: Path, key: str, table: Mapping[str, Any], default: str = 
 
 
 def _read_sampling_rate(path: Path, time: Mapping[str, Any]) -> float:
-    """Return the sampling rate of logs without stamps, Hz; 0 if the logs have stamps.
+    """Return the sampling rate in Hz of logs without time stamps; 0 if the logs have time stamps.
 
     Args:
-        path: path of the description.
+        path: path of the description, for messages.
         time: its table ``[time]``.
+
+    Raises:
+        InputError: the rate is not positive, or a column or unit of stamps is stated as well.
     """
     if "rate" not in time:
         return 0.0
@@ -203,29 +212,32 @@ def _read_sampling_rate(path: Path, time: Mapping[str, Any]) -> float:
 
 
 def list_mapped_files(description: Path) -> list[Path]:
-    """List the files that a description refers to: its table, logs, bags and model file.
+    """List the files that a description may refer to: its table, logs, bags and model file.
 
-    Malformed entries are skipped here; they are refused when the recording is read.
+    Each stated file is listed in the folder of each run; it need not exist there. Malformed entries
+    are skipped here; they are refused when the recording is read.
+
+    Args:
+        description: Path of the description.
     """
     try:
         meta = read_toml(description)
     except InputError:
         return []
-    signals = [
-        _collect_texts(meta.get(kind), "file") for kind in ("channels", "inputs", "extra", "runs")
-    ]
-    folders = _collect_texts(meta.get("runs"), "folder") or [""]
     # A signal without a file is in the table that has the description's name, in each folder.
-    usual = description.with_suffix(".csv").name
-    files = dict.fromkeys([usual, *(name for names in signals for name in names)])
-    paths = [description.parent / folder / file for folder in folders for file in files]
-    model = [name for name in (meta.get("model"),) if isinstance(name, str)]
-    return [*paths, *(description.parent / name for name in model)]
+    files = [description.with_suffix(".csv").name]
+    for key in ("channels", "inputs", "extra", "runs"):
+        files += _collect_texts(meta.get(key), "file")
+    folders = _collect_texts(meta.get("runs"), "folder") or [""]
+    folder_of_all = description.parent
+    paths = [folder_of_all / folder / file for folder in folders for file in dict.fromkeys(files)]
+    model = meta.get("model")
+    return [*paths, folder_of_all / model] if isinstance(model, str) else paths
 
 
-def _collect_texts(tables: Any, word: str) -> list[str]:
-    """Collect all texts under the key `word` in nested tables, such as all stated file names."""
+def _collect_texts(tables: Any, key: str) -> list[str]:
+    """Collect all texts under a key in nested tables, such as all stated file names."""
     if not isinstance(tables, dict):
         return []
-    texts = [tables[word]] if isinstance(tables.get(word), str) else []
-    return texts + [name for table in tables.values() for name in _collect_texts(table, word)]
+    texts = [tables[key]] if isinstance(tables.get(key), str) else []
+    return texts + [text for table in tables.values() for text in _collect_texts(table, key)]

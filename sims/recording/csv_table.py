@@ -33,13 +33,13 @@ def read_csv_fast(
     """Read the run names and the numeric columns of a CSV table with pyarrow.
 
     It gives up where cells are quoted, or a number is missing or not finite, so that the slow
-    reader can locate the error.
+    reader, which inspects each cell, can locate the error.
 
     Args:
         path: Table whose first line is its header.
         header: Checked names of its columns, including ``run``.
         column_names: Names of the numeric columns to read.
-        gaps: Those among them whose cells may be empty (NaN).
+        gaps: Names of those columns whose cells may be empty (NaN).
 
     Returns:
         Name of the run of each row, and the numeric columns (T,) by name; None if anything in the
@@ -74,6 +74,7 @@ def read_csv_fast(
         if np.count_nonzero(~np.isfinite(values)) != allowed_gaps:
             return None
         columns[name] = values
+    # Each different name is converted once.
     runs = table["run"].combine_chunks().dictionary_encode()
     names = [str(name).strip() for name in runs.dictionary.to_pylist()]
     if any('"' in name for name in names):
@@ -142,13 +143,13 @@ def has_run_column(path: Path) -> bool:
 def _make_encoding_error(path: Path) -> InputError:
     """Make the error for a table that is not UTF-8.
 
-    The message names the row of the first invalid byte.
+    The message names the row of the first invalid byte, or UTF-16 if the file is in that encoding.
 
     Args:
         path: Table that cannot be decoded.
     """
     data = path.read_bytes()
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):  # byte order marks
         return InputError(f"{path}: expected UTF-8 text, found UTF-16; save it as UTF-8")
     try:
         data.decode("utf-8-sig")
@@ -175,25 +176,28 @@ class RecordingTable:
             extra: Names of other columns; cells may be empty.
         """
         self.path = path
-        self.wanted = ["run", "t", *inputs, *channels, *extra]
+        self.signals = [*inputs, *channels, *extra]
+        self.numeric = ["t", *self.signals]
+        self.wanted = ["run", *self.numeric]
         self.gaps = {*channels, *extra}
         self.channels, self.inputs = channels, inputs
 
     def read(self) -> list[CsvRun]:
         """Return the runs of the file.
 
-        Large files are parsed by a fast reader first, which does not locate errors.
+        Large files are parsed by a fast reader first. If it gives up, or the name of a run is too
+        long, the file is read cell by cell, to locate the error.
         """
         records = self._iterate_records()
         header = self._check_header(next(records, []))
         parsed = None
         if self.path.stat().st_size >= MIN_FAST_PARSE_BYTES:
-            parsed = read_csv_fast(self.path, header, self.wanted[1:], self.gaps)
-            if parsed and max(map(len, set(parsed[0])), default=0) > MAX_NAME_LENGTH:
-                parsed = None
-        # If the fast reader gives up, read cell by cell to locate the error.
-        names, columns = parsed or self._convert_cells(header, records)
-        return self.split_into_runs(names, columns)
+            parsed = read_csv_fast(self.path, header, self.numeric, self.gaps)
+        if parsed is not None:
+            names, columns = parsed
+            if max(map(len, set(names)), default=0) <= MAX_NAME_LENGTH:
+                return self.split_into_runs(names, columns)
+        return self.split_into_runs(*self._convert_cells(header, records))
 
     def _convert_cells(
         self, header: list[str], records: Iterator[list[str]]
@@ -201,25 +205,21 @@ class RecordingTable:
         """Convert the rows below the header to run names and numeric columns (T,).
 
         Rows are converted in blocks, so that the texts of a long table are never all in memory.
+
+        Args:
+            header: Names of the columns.
+            records: Cells of each row below the header.
         """
         names: list[str] = []
-        converted_blocks: list[list[Array]] = []
+        blocks: dict[str, list[Array]] = {name: [np.empty(0)] for name in self.numeric}
         while rows := list(islice(records, _ROWS_PER_CHUNK)):
-            padded_rows = self._check_row_widths(rows, len(header), len(names))
-            by_column = zip(*padded_rows, strict=True)
-            cells = dict(zip(header, by_column, strict=True))
-            converted_blocks.append(
-                [
-                    self._convert_to_numbers(name, cells[name], len(names))
-                    for name in self.wanted[1:]
-                ]
-            )
+            first_row = len(names)
+            self._check_row_widths(rows, len(header), first_row)
+            cells = dict(zip(header, zip(*rows, strict=True), strict=True))
+            for name, numbers in blocks.items():
+                numbers.append(self._convert_to_numbers(name, cells[name], first_row))
             names += [name.strip() for name in cells["run"]]
-        numeric = self.wanted[1:]
-        if not converted_blocks:
-            return names, {name: np.empty(0) for name in numeric}
-        columns = map(np.concatenate, zip(*converted_blocks, strict=True))
-        return names, dict(zip(numeric, columns, strict=True))
+        return names, {name: np.concatenate(numbers) for name, numbers in blocks.items()}
 
     def _iterate_records(self) -> Iterator[list[str]]:
         """Iterate over header and rows; skip blank lines."""
@@ -248,12 +248,12 @@ class RecordingTable:
         # A single column is most likely due to another separator.
         if len(header) < 2:
             text = "".join(header)
-            separators = [
-                name for mark, name in ((";", "semicolons"), ("\t", "tabs")) if mark in text
-            ]
-            found_text = (
-                f"{separators[0]} (save it with commas)" if separators else format_value(text)
-            )
+            if ";" in text:
+                found_text = "semicolons (save it with commas)"
+            elif "\t" in text:
+                found_text = "tabs (save it with commas)"
+            else:
+                found_text = format_value(text)
             raise InputError(
                 f"{self.path}, row 1: expected columns {', '.join(self.wanted)} between commas, "
                 f"found {found_text}"
@@ -271,13 +271,15 @@ class RecordingTable:
                 description = self.path.with_suffix(".toml").name
                 raise InputError(
                     f"{self.path}: column {format_value(name)} is not declared; {description} "
-                    f"declares {_join_names(self.wanted[2:])}; add it with its unit under "
+                    f"declares {_join_names(self.signals)}; add it with its unit under "
                     "[inputs], [channels] or, if nothing reads it, [extra]"
                 )
         return header
 
     def make_missing_column_error(self, name: str, found: Sequence[str]) -> InputError:
-        """Return an error that lists the columns, with the most similar one that is not declared.
+        """Make the error for a missing column, which lists the columns of the table.
+
+        It suggests the most similar one of those that the description does not declare.
 
         Args:
             name: name of the missing column.
@@ -288,23 +290,23 @@ class RecordingTable:
             f"{self.path}: expected column '{name}', found columns {_join_names(found)}{hint}"
         )
 
-    def _check_row_widths(
-        self, rows: list[list[str]], width: int, first_row: int
-    ) -> list[list[str]]:
-        """Check that all rows have as many cells as the header, and return them.
+    def _check_row_widths(self, rows: list[list[str]], width: int, first_row: int) -> None:
+        """Check that all rows have as many cells as the header.
 
         Args:
             rows: Cells of each row.
             width: Number of cells of the header.
-            first_row: Number of the first of these rows, counted from 0.
+            first_row: Number of the first of these rows, counted from 0 below the header.
+
+        Raises:
+            InputError: A row has another number of cells.
         """
-        if set(map(len, rows)) != {width}:
-            record, row = next((i, row) for i, row in enumerate(rows) if len(row) != width)
-            raise InputError(
-                f"{self.path}, row {self._find_line_number(first_row + record)}: "
-                f"expected {width} cells as in the header, found {len(row)}"
-            )
-        return rows
+        for record, row in enumerate(rows, start=first_row):
+            if len(row) != width:
+                raise InputError(
+                    f"{self.path}, row {self._find_line_number(record)}: "
+                    f"expected {width} cells as in the header, found {len(row)}"
+                )
 
     def _convert_to_numbers(self, name: str, cells: Sequence[str], first_row: int) -> Array:
         """Convert the cells of a column to numbers (T,); empty ones to NaN where gaps are allowed.
@@ -315,7 +317,10 @@ class RecordingTable:
         Args:
             name: Name of the column.
             cells: Text of each cell.
-            first_row: Number of the first of these rows, counted from 0.
+            first_row: Number of the first of these rows, counted from 0 below the header.
+
+        Raises:
+            InputError: A cell is not a finite number, nor an empty one in a column with gaps.
         """
         try:
             values = np.array(list(map(float, cells)))
@@ -323,12 +328,12 @@ class RecordingTable:
             values = np.array(
                 [float(c) if _NUMBER_PATTERN.fullmatch(c) else math.nan for c in cells]
             )
-        suspects: Iterable[int] = np.flatnonzero(~np.isfinite(values)).tolist()
+        suspect_indices: Iterable[int] = np.flatnonzero(~np.isfinite(values)).tolist()
         joined_cells = "".join(cells)
         # float() also accepts 1_000 and digits of other scripts.
         if "_" in joined_cells or not joined_cells.isascii():
-            suspects = range(len(cells))
-        for row_index in suspects:
+            suspect_indices = range(len(cells))
+        for row_index in suspect_indices:
             if cells[row_index].strip() or name not in self.gaps:
                 self._check_cell(name, cells[row_index], first_row + row_index)
         return values
@@ -357,7 +362,7 @@ class RecordingTable:
         The checks concern the name of each run, its number of rows, its samples, and its times.
 
         Args:
-            names: Name of the run of each row.
+            names: Name of the run of each of the T rows.
             columns: Times ``t`` and all other columns by name, each (T,); NaN where a cell is
                 empty.
 
@@ -371,7 +376,8 @@ class RecordingTable:
             if np.isnan(columns[name]).all():
                 raise InputError(f"{self.path}: column {name} has no sample; leave the channel out")
         # First row of each run, and the number of rows.
-        edges = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(names)) if a != b), len(names)]
+        changes = [row for row in range(1, len(names)) if names[row] != names[row - 1]]
+        edges = [0, *changes, len(names)]
         self._check_times_increase(columns["t"], edges)
         runs: dict[str, CsvRun] = {}
         for begin, end in pairwise(edges):
@@ -388,7 +394,7 @@ class RecordingTable:
                     f"run {format_value(name)} continues after another run began; "
                     "expected its rows together",
                 )
-            signals = {c: make_read_only(columns[c][begin:end]) for c in self.wanted[2:]}
+            signals = {c: make_read_only(columns[c][begin:end]) for c in self.signals}
             if end - begin < 2:
                 self.raise_error(
                     begin, "run", f"run {format_value(name)} has one row; expected at least two"
@@ -404,14 +410,16 @@ class RecordingTable:
         return list(runs.values())
 
     def _check_seconds(self, t: Array, first: int, last: int) -> None:
-        """Check that the stamps of a run can be seconds, and not milliseconds.
+        """Check that the stamps of a run can be seconds, and not a smaller unit.
+
+        The latest stamp and the duration of the run must be plausible.
 
         Args:
             t: (N,) time stamps of all rows of the table.
             first: index of the first row of the run.
             last: index of its last row.
         """
-        latest = max(-t[first], t[last])
+        latest = max(-t[first], t[last])  # largest magnitude, since times increase
         if latest > MAX_TIMESTAMP_SECONDS:
             years = f"{latest:.4g}, which would be {latest / _SECONDS_PER_YEAR:.2g} years"
             self.raise_error(
@@ -425,8 +433,11 @@ class RecordingTable:
         """Check that the times increase within each run.
 
         Args:
-            t: (T,) times.
+            t: (T,) times of all rows, s.
             edges: First row of each run, and the number of rows.
+
+        Raises:
+            InputError: A time does not exceed the previous one of its run.
         """
         is_bad = t[1:] <= t[:-1]
         # A run may begin earlier than the previous one ended.
@@ -458,7 +469,11 @@ class RecordingTable:
         return f"{self.path}, row {self._find_line_number(record)}"
 
     def _find_line_number(self, record: int) -> int:
-        """Return the line on which row `record` (counted from 0) ends; reads the file again."""
+        """Return the line of the file on which a row ends, counted from 1; reads the file again.
+
+        Args:
+            record: number of the row, counted from 0 below the header, without blank lines.
+        """
         with self.path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True, skipinitialspace=True)
             with suppress(csv.Error):  # the fast reader accepts such cells

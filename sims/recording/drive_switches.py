@@ -50,12 +50,13 @@ class DriveSwitch(NamedTuple):
         """
         values = run.extra[self.column]
         is_recorded = np.isfinite(values)
-        # Index of the last recorded sample up to each sample; -1 before the first one.
-        last = np.maximum.accumulate(np.where(is_recorded, np.arange(values.size), -1))
-        first = int(np.argmax(is_recorded)) if is_recorded.any() else 0
-        filled = values[np.where(last < 0, first, last)]
+        if not is_recorded.any():
+            return np.zeros(values.size, dtype=np.bool_)
+        # Index of the last recorded sample up to each sample; the first one before that.
+        indices = np.where(is_recorded, np.arange(values.size), int(np.argmax(is_recorded)))
+        filled = values[np.maximum.accumulate(indices)]
         off: Mask = (filled == 0) == self.zero_is_off
-        return off & bool(is_recorded.any())
+        return off
 
     @property
     def line(self) -> str:
@@ -75,6 +76,10 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
     While a drive is off, for example after an emergency stop, its actuator exerts no force. The
     keys ``enable`` and ``disable`` of an actuator name the column that says when.
 
+    Args:
+        path: Path of the description, for messages.
+        meta: Content of the description.
+
     Raises:
         InputError: A column name is not a text, or a drive has both keys.
     """
@@ -90,12 +95,14 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
 
 
 def remove_switch_keys(actuators: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tables of actuators that the model file lacks, without the keys of this module.
+    """Return the tables of the actuators to be added to the model file, without switch keys.
 
     A switch key names the column that says when the drive is on; it does not describe an actuator.
+    A table with nothing else belongs to an actuator of the model file and is left out.
 
     Args:
-        actuators: Tables ``[actuators.NAME]`` of a description.
+        actuators: Tables ``[actuators.NAME]`` of a description. Entries of a wrong type are kept,
+            so that they are refused later.
     """
     kept_tables = {}
     for name, table in actuators.items():
@@ -103,7 +110,6 @@ def remove_switch_keys(actuators: Mapping[str, Any]) -> dict[str, Any]:
             kept_tables[name] = table
             continue
         other_entries = {key: value for key, value in table.items() if key not in SWITCH_KEYS}
-        # A table with a switch column only belongs to an actuator of the model file.
         if other_entries or not table:
             kept_tables[name] = other_entries
     return kept_tables
@@ -150,9 +156,9 @@ class Switched(NamedTuple):
 def apply_drive_switches(
     path: Path, runs: Sequence[Run], switches: Sequence[DriveSwitch]
 ) -> Switched:
-    """Add to each run at which samples its drives are off, with notes for the user.
+    """Add to each run the masks of samples at which its drives are off, with notes for the user.
 
-    A drive that is off makes no force, whatever its command is. Drives that are off in the same
+    A drive that is off exerts no force, whatever its command is. Drives that are off in the same
     samples share a note.
 
     Args:
@@ -163,8 +169,9 @@ def apply_drive_switches(
     Raises:
         InputError: A drive is never on.
     """
-    notes: dict[str, list[str]] = {}
-    by_run: list[dict[str, Mask]] = [{} for _ in runs]
+    # Names of the actuators by the condition and the time spans in which they are off.
+    actuators_by_condition: dict[str, list[str]] = {}
+    masks_by_run: list[dict[str, Mask]] = [{} for _ in runs]
     for switch in switches:
         off_masks = [switch.off(run) for run in runs]
         if all(mask.all() for mask in off_masks):
@@ -172,43 +179,43 @@ def apply_drive_switches(
                 f"{path}: {switch.condition} in all samples: actuator {switch.actuator} is never "
                 f"on; expected samples in which it is, or another column in {switch.line}"
             )
-        for masks, mask in zip(by_run, off_masks, strict=True):
+        for masks, mask in zip(masks_by_run, off_masks, strict=True):
             if mask.any():
                 masks[switch.actuator] = mask
         if any(mask.any() for mask in off_masks):
-            note = f"where {switch.condition}: {format_run_spans(runs, off_masks)}"
-            notes.setdefault(note, []).append(switch.actuator)
-    run_notes = [
-        f"actuator {names[0]} exerts nothing {note}"
-        if len(names) == 1
-        else f"actuators {', '.join(names)} exert nothing {note}"
-        for note, names in notes.items()
-    ]
-    switched = tuple(
-        replace(run, off=masks) if masks else run for run, masks in zip(runs, by_run, strict=True)
+            condition = f"where {switch.condition}: {format_run_spans(runs, off_masks)}"
+            actuators_by_condition.setdefault(condition, []).append(switch.actuator)
+    notes = []
+    for condition, names in actuators_by_condition.items():
+        if len(names) == 1:
+            notes.append(f"actuator {names[0]} exerts nothing {condition}")
+        else:
+            notes.append(f"actuators {', '.join(names)} exert nothing {condition}")
+    switched_runs = tuple(
+        replace(run, off=masks) if masks else run
+        for run, masks in zip(runs, masks_by_run, strict=True)
     )
-    return Switched(switched, tuple(run_notes))
+    return Switched(switched_runs, tuple(notes))
 
 
-def format_run_spans(runs: Sequence[Run], off: Sequence[Mask]) -> str:
-    """Describe the time spans of each run in which a mask is set.
+def format_run_spans(runs: Sequence[Run], masks: Sequence[Mask]) -> str:
+    """Format the time spans of each run in which a mask is set, for a message.
 
     Args:
-        runs: Runs.
-        off: Mask (T,) of each run.
+        runs: Runs; at most `MAX_LISTED_RUNS` of those with a span are listed.
+        masks: Mask (T,) of each run.
     """
     run_texts = []
-    for run, mask in zip(runs, off, strict=True):
+    for run, mask in zip(runs, masks, strict=True):
         span_texts = [
             f"{run.times[first]:.4g} to {run.times[end - 1]:.4g} s" for first, end in spans(mask)
         ]
-        run_texts += [f"run {run.name}, {', '.join(span_texts)}"] if span_texts else []
-    suffix = (
-        f"; and {len(run_texts) - MAX_LISTED_RUNS} more runs"
-        if len(run_texts) > MAX_LISTED_RUNS
-        else ""
-    )
-    return f"{'; '.join(run_texts[:MAX_LISTED_RUNS])}{suffix}"
+        if span_texts:
+            run_texts.append(f"run {run.name}, {', '.join(span_texts)}")
+    text = "; ".join(run_texts[:MAX_LISTED_RUNS])
+    if len(run_texts) > MAX_LISTED_RUNS:
+        text += f"; and {len(run_texts) - MAX_LISTED_RUNS} more runs"
+    return text
 
 
 def spans(mask: Mask) -> list[tuple[int, int]]:

@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 
 from sims.core.plain_values import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
 from sims.core.simulator import Array, InputError, make_read_only
-from sims.core.toml_validation import (
-    toml_key,
-)
+from sims.core.toml_validation import toml_key
 from sims.recording.column_mapping import RecordingSources
 from sims.recording.csv_table import CsvRun
 from sims.recording.log_formats.log_columns import LogFile
@@ -35,15 +33,15 @@ def read_logs(
     inputs: Sequence[str],
     linear: frozenset[str],
 ) -> list[CsvRun]:
-    """Read the runs of a recording from its logs.
+    """Read the runs of a recording from its logs, which may have different time stamps.
 
-    The rows of a run are all times at which a sensor or an input has a stamp, from the first to the
-    last sample of a sensor. The cells of a sensor are empty between its own stamps, so that
+    The rows of a run are all times at which a channel or an input has a stamp, from the first to
+    the last sample of a channel. The cells of a channel are empty between its own stamps, so that
     measurements are not resampled; an input has its held or interpolated value at all times, and an
     extra column its held value.
 
     Args:
-        path: Table in which signals without a file are found.
+        path: Table in which signals without a stated file are found.
         sources: Location of each signal.
         channels: Names of the measured signals.
         inputs: Names of the inputs.
@@ -89,9 +87,10 @@ class _FolderLogs:
         channels: Sequence[str],
         inputs: Sequence[str],
     ) -> None:
-        """Find the file of each signal, and read the needed columns of each file once.
+        """Find the file of each signal, and read the needed columns of each file.
 
-        An extra column without a stated file is searched for in the files of the signals.
+        An extra column without a stated file is searched for in the files of the other signals. The
+        time stamps are read from each file, unless a sampling rate replaces them.
 
         Args:
             folder: Folder of the logs.
@@ -122,15 +121,19 @@ class _FolderLogs:
     def list_runs(self, name: str) -> list[tuple[str, Mask | None]]:
         """Return the names of the runs in these files, each with a mask of its rows.
 
-        The mask is None where all rows belong to one run.
+        There are several runs only if a single file has a column ``run`` with their numbers, and
+        the description does not name the run. Otherwise the mask is None: all rows are one run.
+
+        Args:
+            name: Name of the run in the description; empty if it names none.
         """
-        first = next(iter(self._logs.values()))
-        is_one_file = all(log.path == first.path for log in self._logs.values())
-        if name or not is_one_file or "run" not in first.columns:
+        first_log = next(iter(self._logs.values()))
+        is_one_file = all(log.path == first_log.path for log in self._logs.values())
+        if name or not is_one_file or "run" not in first_log.columns:
             return [(name or "1", None)]
-        numbers = first.get_column("run")
-        order = list(dict.fromkeys(numbers.tolist()))
-        return [(f"{number:g}", numbers == number) for number in order]
+        run_numbers = first_log.get_column("run")
+        different_numbers = dict.fromkeys(run_numbers.tolist())
+        return [(f"{number:g}", run_numbers == number) for number in different_numbers]
 
     def join(self, run: str, run_rows: Mask | None, linear: frozenset[str]) -> CsvRun:
         """Join the logs of one run into a table.
@@ -154,13 +157,13 @@ class _FolderLogs:
             values = self._read_signal(channel, rows_of[log.path])
             if not np.isfinite(values).any():
                 raise InputError(f"{log.path}: column {channel} has no sample; leave it out")
-            # Write the channel into the rows of the table that have its own stamps.
+            # Write the values into the rows of the table that have the stamps of the channel.
             stamps = rows_of[log.path].stamps
-            values_at_times = np.full(times.size, np.nan)
             row_indices = np.searchsorted(times, stamps - SAME_INSTANT_SECONDS)
             is_in_run = (row_indices < times.size) & (stamps >= times[0] - SAME_INSTANT_SECONDS)
-            values_at_times[row_indices[is_in_run]] = values[is_in_run]
-            columns[channel] = make_read_only(values_at_times)
+            column = np.full(times.size, np.nan)
+            column[row_indices[is_in_run]] = values[is_in_run]
+            columns[channel] = make_read_only(column)
         for name in (*self._inputs, *self._extra):
             columns[name] = make_read_only(
                 self._resample_signal(name, rows_of, times, name in linear)
@@ -170,21 +173,25 @@ class _FolderLogs:
     def _select_rows(self, run_rows: Mask | None) -> tuple[dict[Path, _LogRows], list[str]]:
         """Return the rows of each log that are used, and notes on those that are left out.
 
-        Of rows with the same stamp, only the first is used.
+        Of rows with the same stamp, only the first is used. Stamps are converted to seconds from
+        the first stamp of all logs.
+
+        Args:
+            run_rows: Mask of the run's rows; None for all rows.
         """
         rows_of: dict[Path, _LogRows] = {}
         notes = []
         for log in self._logs.values():
             if log.path in rows_of:
                 continue
-            stamps, is_first = self._read_stamps(log, run_rows)
+            stamps, is_new = self._read_stamps(log, run_rows)
             numbers = np.arange(stamps.size) if run_rows is None else np.flatnonzero(run_rows)
-            rows_of[log.path] = _LogRows(stamps[is_first], numbers[is_first])
-            if not is_first.all():
-                repeated = f"{int((~is_first).sum())} of {stamps.size} stamps repeat the one before"
+            rows_of[log.path] = _LogRows(stamps[is_new], numbers[is_new])
+            if not is_new.all():
+                repeated = f"{int((~is_new).sum())} of {stamps.size} stamps repeat the one before"
                 notes.append(f"{log.path}: {repeated}; their {log.rows}s are left out")
-        # Clocks of robots count from 1970: the remaining resolution is too coarse for rates, so
-        # subtract the first stamp.
+        # Clocks of robots count from 1970, which leaves floats a coarse resolution; so the first
+        # stamp is subtracted before scaling.
         first_stamp = min(rows.stamps[0] for rows in rows_of.values())
         return {
             path: rows._replace(stamps=self._second * (rows.stamps - first_stamp))
@@ -192,13 +199,17 @@ class _FolderLogs:
         }, notes
 
     def _sample_times(self, run: str, rows_of: Mapping[Path, _LogRows]) -> Array:
-        """Return the times (T,) of a run in seconds: all instants at which a signal has a sample.
+        """Return the times (T,) of a run in seconds: all stamps of its channels and inputs.
 
-        Instants of inputs before the first or after the last measurement are left out.
+        Stamps of inputs before the first or after the last measurement are left out, and stamps
+        that differ by rounding count as one.
 
         Args:
-            run: name of the run.
+            run: name of the run, for messages.
             rows_of: stamps and rows of each log, by path.
+
+        Raises:
+            InputError: the run is too short.
         """
 
         def stamps_of(names: Sequence[str]) -> list[Array]:
@@ -216,7 +227,7 @@ class _FolderLogs:
     def _read_signal(self, signal: str, rows: _LogRows) -> Array:
         """Return the values (N,) of a signal in the rows of a run, in the unit of the log.
 
-        A signal may combine several columns, for example a quaternion.
+        A signal may be a weighted sum of several columns, for example of coupled drives.
 
         Args:
             signal: Name of the channel or input.
@@ -246,6 +257,7 @@ class _FolderLogs:
         """Return the values of an input or an extra column at all times of a run.
 
         Its own stamps differ from these times, so its last value is held, or it is interpolated.
+        Before its first stamp, it has its first value.
 
         Args:
             signal: Name of the signal.
@@ -272,18 +284,19 @@ class _FolderLogs:
             )
         if is_linear:
             return np.interp(times, rows.stamps, values)
-        row_indices = np.searchsorted(rows.stamps, times + SAME_INSTANT_SECONDS, side="right") - 1
-        held_values: Array = values[np.maximum(row_indices, 0)]
+        last_rows = np.searchsorted(rows.stamps, times + SAME_INSTANT_SECONDS, side="right") - 1
+        held_values: Array = values[np.maximum(last_rows, 0)]
         return held_values
 
     def _read_stamps(self, log: LogFile, run_rows: Mask | None) -> tuple[Array, Mask]:
-        """Return the stamps (N,) of a log in its own unit, and a mask of the unrepeated ones.
+        """Return the stamps (N,) of a log in its own unit, and a mask of those that are new.
 
-        Without stamps, they follow from the sampling rate, in seconds. Few repeated stamps are
-        tolerated (only the first row of each counts), many mean that the column is not a clock.
+        A stamp that repeats the previous one is not new. Few repeated stamps are tolerated, many
+        mean that the column is not a clock. If the log has no stamps, they follow from the sampling
+        rate, in seconds.
 
         Args:
-            log: log: its columns of numbers by name.
+            log: log with its columns by name.
             run_rows: mask of the rows of one run; None for all.
 
         Raises:
@@ -314,12 +327,17 @@ class _FolderLogs:
                 f"{location}, {log.rows} {row}: expected more than {stamps[bad_steps[0]]:.12g}, "
                 f"found {stamps[bad_steps[0] + 1]:.12g}; take out rows that came twice or late"
             )
-        is_first: Mask = np.diff(stamps, prepend=-np.inf) > 0
-        return np.asarray(stamps), is_first
+        is_new: Mask = np.diff(stamps, prepend=-np.inf) > 0
+        return np.asarray(stamps), is_new
 
 
 def _find_file(folder: Path, column: str, files: Sequence[str]) -> str:
     """Return the first of some files that has a column, for an extra column without a file.
+
+    Args:
+        folder: folder of the logs.
+        column: name of the column, in any case.
+        files: names of the files.
 
     Raises:
         InputError: No file has it.

@@ -35,31 +35,39 @@ MAX_NORM_ERROR = 0.1
 
 
 def find_recorded_bases(channels: Iterable[str]) -> list[str]:
-    """Find the floating joints of bodies whose whole pose is among the channels.
+    """Find the floating joints of bodies whose pose is among the channels.
 
-    A pose is a position, ``q.BASE.x``, y and z, unless BASE is a ball joint, and a quaternion,
-    ``q.BASE.qw``, qx, qy and qz, or the three angles.
+    The channels of a joint BASE are its quaternion, ``q.BASE.qw``, qx, qy and qz, or its position
+    ``q.BASE.x``, y and z and the angles ``q.BASE.yaw``, pitch and roll. (With a quaternion, a
+    missing position is not noticed here, since a ball joint has none.)
+
+    Args:
+        channels: Names of the recorded channels.
+
+    Returns:
+        Names of the joints in alphabetical order.
     """
     names = set(channels)
-    found = []
+    bases = []
     for name in sorted(names):
-        match = re.fullmatch(r"q\.(.+)\.(qw|yaw)", name)
-        if match is None or match[1] in found:
+        match = re.fullmatch(r"q\.(?P<base>.+)\.(qw|yaw)", name)
+        if match is None or match["base"] in bases:
             continue
-        is_quaternion = {f"q.{match[1]}.{entry}" for entry in QUATERNION_ENTRIES} <= names
-        is_pose = {f"q.{match[1]}.{entry}" for entry in (*POSITION_AXES, *ANGLES)} <= names
-        if is_quaternion or is_pose:
-            found.append(match[1])
-    return found
+        base = match["base"]
+        has_quaternion = {f"q.{base}.{entry}" for entry in QUATERNION_ENTRIES} <= names
+        has_angles = {f"q.{base}.{entry}" for entry in (*POSITION_AXES, *ANGLES)} <= names
+        if has_quaternion or has_angles:
+            bases.append(base)
+    return bases
 
 
 def convert_quaternions(
     channels: Mapping[str, Array], base: str, reference: Array, where: str
 ) -> dict[str, Array]:
-    """Replace the quaternion of a floating body among the channels of a run by its three angles.
+    """Replace the quaternion of a floating body among the channels of a run by yaw, pitch and roll.
 
     In the simulation the body has three hinges in place of its quaternion, whose coordinates are
-    these angles.
+    these angles. Channels without a quaternion of the body are returned unchanged.
 
     Args:
         channels: channels of the run by name, each (T,).

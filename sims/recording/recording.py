@@ -106,11 +106,11 @@ class Run:
     def part(self, rows: slice, name: str = "") -> Run:
         """Return a part of the run as a run of its own.
 
-        It is used to divide a long run into segments, for example. Inputs before the part remain
-        known as its history.
+        It is used to divide a long run into segments, for example. Inputs before the part are
+        stored as its history, for effects such as a delay.
 
         Args:
-            rows: Samples of the part.
+            rows: Samples of the part; a slice with a step thins the run.
             name: Name of the part; that of the run if empty.
         """
 
@@ -138,17 +138,16 @@ class Run:
 
         Args:
             name: Name of the input.
-            row: Number of the sample.
+            row: Index of the sample.
 
         Returns:
             (2, K) times relative to the sample (s, negative) and values.
         """
-        earlier_samples = self.before.get(name, np.empty((2, 0)))
-        stamps = (
-            np.concatenate([earlier_samples[0] + self.times[0], self.times[:row]]) - self.times[row]
-        )
-        samples = np.stack([stamps, np.concatenate([earlier_samples[1], self.inputs[name][:row]])])
-        return samples[:, stamps >= -self.memory]
+        # Times in this history are relative to the first sample of the run.
+        earlier_times, earlier_values = self.before.get(name, np.empty((2, 0)))
+        times = np.concatenate([earlier_times + self.times[0], self.times[:row]]) - self.times[row]
+        values = np.concatenate([earlier_values, self.inputs[name][:row]])
+        return np.stack([times, values])[:, times >= -self.memory]
 
 
 @dataclass(frozen=True, repr=False)
@@ -204,15 +203,19 @@ class Recording:
 def read_recording(path: str | Path, declared: DeclaredSignals, whole: bool = False) -> Recording:
     """Read `NAME.csv` and `NAME.toml` and check them against a system.
 
-    Channels, inputs, constants and states must be those of the system. The description decides how
-    the data are stored: a table with the names of the system, a table with other names, or logs of
-    several files that are joined by time.
+    Channels, inputs, constants and states must be those of the system. The description decides
+    which of these is read:
+
+    * a table in the format of simgap, whose columns have the names of the system's signals
+    * such a table with other names of columns
+    * logs, perhaps in several files, which are joined by their time stamps
 
     Args:
         path: Path of the table.
         declared: System, or simulator of it; `read_system_name` reads which system the recording
             states.
-        whole: Whether to hold out only the marked runs, and not to split a single run.
+        whole: Whether to hold out only the runs that the description marks; False to hold out every
+            third run, or the last third of a single run, if no run is marked.
 
     Raises:
         InputError: The recording is malformed; the message is one line.
@@ -220,14 +223,14 @@ def read_recording(path: str | Path, declared: DeclaredSignals, whole: bool = Fa
     table = Path(path)
     description_path, meta = read_meta(table)
     description = check_description(description_path, meta, declared)
-    columns = list(description.channels), list(description.inputs)
+    channels, inputs = list(description.channels), list(description.inputs)
     csv_path = table.with_suffix(".csv") if table.suffix == ".toml" else table
     sources = description.sources
     if not sources.stated or (sources.is_renaming and has_run_column(csv_path)):
         table = csv_path
-        parts = _read_own_table(csv_path, sources, *columns, list(description.extra))
+        parts = _read_own_table(csv_path, sources, channels, inputs, list(description.extra))
     else:
-        parts = read_logs(table.with_suffix(".csv"), sources, *columns, description.linear)
+        parts = read_logs(table.with_suffix(".csv"), sources, channels, inputs, description.linear)
     model = get_model_reference(description_path, meta)
     recording = _assemble_recording(table, parts, description, description_path, model)
     if whole:
@@ -248,7 +251,7 @@ def _assemble_recording(
 
     Args:
         table: path of the table.
-        parts: rows of each run.
+        parts: table of each run, in the units of the file.
         description: checked description.
         description_path: its path, for messages.
         model: model file of a robot; None for a system.
@@ -279,7 +282,7 @@ def _read_own_table(
     inputs: Sequence[str],
     extra: Sequence[str],
 ) -> list[CsvRun]:
-    """Read a table written for simgap, whose columns the description may rename.
+    """Read a table in the format of simgap, whose columns the description may rename.
 
     Args:
         path: Path of the table.
@@ -293,13 +296,14 @@ def _read_own_table(
     """
 
     def columns_of(names: Sequence[str]) -> list[str]:
+        """Return the columns of some signals, each once; a signal may combine several."""
         return list(dict.fromkeys(c for name in names for c in sources.signals[name].columns))
 
-    measured = columns_of(channels)
-    input_columns = [column for column in columns_of(inputs) if column not in measured]
+    channel_columns = columns_of(channels)
+    input_columns = [column for column in columns_of(inputs) if column not in channel_columns]
     extra_columns = {name: sources.extra[name].columns[0] for name in extra}
     renamed_runs = []
-    for part in read_table(path, measured, input_columns, list(extra_columns.values())):
+    for part in read_table(path, channel_columns, input_columns, list(extra_columns.values())):
         values = {
             name: sources.signals[name].combine(part.columns.__getitem__)
             for name in (*channels, *inputs)
@@ -374,13 +378,19 @@ def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> R
     cell of an extra column, unless the description states it.
 
     Args:
-        table: CSV file of the run, for error messages.
+        table: path of the table, for messages.
         part: columns of the run in the units of the file.
         description: units, scales and metadata from the TOML file.
     """
     metadata = description.runs.get(part.name, _UNMARKED)
-    channels = {n: _convert_column(table, part, n, s) for n, s in description.channels.items()}
-    inputs = {n: _convert_column(table, part, n, s) for n, s in description.inputs.items()}
+    channels = {
+        name: _convert_column(table, part, name, scale)
+        for name, scale in description.channels.items()
+    }
+    inputs = {
+        name: _convert_column(table, part, name, scale)
+        for name, scale in description.inputs.items()
+    }
     for base, reference in description.orientations.items():
         where = f"{table}: run {part.name!r}"
         channels = convert_quaternions(channels, base, reference, where)
@@ -389,9 +399,9 @@ def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> R
     # Extra columns keep their unit, because no system reads them.
     extra = {name: part.columns[name] for name in description.extra if name in part.columns}
     initial_values = {
-        n: s.gain * extra[n][0] + s.offset
-        for n, s in description.initial_pose_scales.items()
-        if n in extra
+        name: scale.gain * extra[name][0] + scale.offset
+        for name, scale in description.initial_pose_scales.items()
+        if name in extra
     }
     initial_pose = {
         name: float(value) for name, value in initial_values.items() if np.isfinite(value)
@@ -420,12 +430,12 @@ def _convert_column(table: Path, part: CsvRun, name: str, scale: UnitScale) -> A
         scale: conversion from the unit of the column to SI units.
 
     Raises:
-        InputError: A value is too large for that.
+        InputError: A converted value is too large for a floating-point number.
     """
     values = part.columns[name]
     if scale == IDENTITY_SCALE:
         return values
-    # An overflow is reported below with the name of its column, which a warning would not have.
+    # An overflow is reported below with the name of its column, which a warning would lack.
     with np.errstate(over="ignore"):
         result = values * scale.gain + scale.offset
     if np.isinf(result).any():
@@ -439,14 +449,21 @@ def _convert_column(table: Path, part: CsvRun, name: str, scale: UnitScale) -> A
 def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
     """Divide the runs into runs for fitting and held-out runs, on which predictions are tested.
 
-    Runs that the description marks are held out. Without marks, it is the last third of a single
-    run, or every third of several runs. With `folds`, two or three unmarked runs get a number each,
-    and each is predicted from the others (cross-validation).
+    There are four cases:
+
+    * Some runs are marked as held out: only these are.
+    * A single run is divided into two; its last third is held out.
+    * Two or three runs, with `folds`: each gets the number of a cross-validation fold, and is
+      predicted from the others.
+    * Otherwise every third run is held out; of two, the second.
 
     Args:
         path: path of the recording, for messages.
         runs: all runs.
-        folds: whether few runs get folds of a cross-validation in place of held-out runs.
+        folds: whether to cross-validate two or three unmarked runs.
+
+    Raises:
+        InputError: all runs are marked as held out, or a single run is too short.
     """
     runs = [replace(run, fold=None) for run in runs]
     if any(run.held_out for run in runs):
@@ -460,13 +477,14 @@ def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]
         return _split_run(path, runs[0])
     if folds and len(runs) <= MAX_FOLDS:
         return tuple(replace(run, fold=number) for number, run in enumerate(runs))
-    # Hold out the last of every three runs, so that early and late ones are fitted; of two, the
-    # second.
-    marked = [
+    # The last of every three runs, so that the first ones are fitted.
+    is_held_out = [
         i % _HELD_OUT_STRIDE == _HELD_OUT_STRIDE - 1 or (len(runs) == 2 and i == 1)
         for i in range(len(runs))
     ]
-    return tuple(replace(run, held_out=mark) for run, mark in zip(runs, marked, strict=True))
+    return tuple(
+        replace(run, held_out=held_out) for run, held_out in zip(runs, is_held_out, strict=True)
+    )
 
 
 def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
@@ -488,8 +506,8 @@ def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
         replace(run.part(slice(split_index, None)), held_out=True),
     )
     for part in parts:
-        measured = any(np.isfinite(values).any() for values in part.channels.values())
-        if len(part.times) < 2 or not measured:
+        is_measured = any(np.isfinite(values).any() for values in part.channels.values())
+        if len(part.times) < 2 or not is_measured:
             raise InputError(
                 f"{path}: the only run is too short to hold its last third out: {count} rows; "
                 "expected at least 4, with samples in both parts"

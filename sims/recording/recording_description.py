@@ -161,8 +161,8 @@ def get_model_reference(
 ) -> ModelFileReference | None:
     """Return the model file that a description states; None if it states a system.
 
-    It comes with what the description adds to the file: actuators, engine settings, the floating
-    joints whose pose is recorded, and free parameters.
+    It comes with what the description adds to the file: actuators, engine settings (among them the
+    floating joints whose pose is recorded), and free parameters.
 
     Args:
         description: Path of the description, for messages; the path of the model file is relative
@@ -221,11 +221,11 @@ def read_stated_columns(
 
     Args:
         path: Table of the recording, `NAME.csv`.
-        declared: System of the recording.
+        declared: System of the recording, or simulator of it.
 
     Returns:
-        By channel and input: the stated unit, the factor from the numbers of the column to SI
-        units, and the stated `scale`, which is part of that factor.
+        Three entries by channel and input: the stated unit, the factor from the numbers of the
+        column to SI units, and the stated `scale`, which is part of that factor.
 
     Raises:
         InputError: The description is missing or malformed.
@@ -234,8 +234,12 @@ def read_stated_columns(
     reader = _DescriptionReader(description, read_toml(description), declared)
     columns = {**reader.read_channels(), **reader.read_columns("input", declared.inputs)}
     return {
-        name: (str(c.table["unit"]), c.scale.gain, float(c.table.get("scale", 1.0)))
-        for name, c in columns.items()
+        name: (
+            str(column.table["unit"]),
+            column.scale.gain,
+            float(column.table.get("scale", 1.0)),
+        )
+        for name, column in columns.items()
     }
 
 
@@ -310,8 +314,9 @@ class _DescriptionReader:
     def __init__(self, path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
         """Store the description, and list the signals that it may state.
 
-        `orientations` are those in the model file of floating bodies whose pose is recorded. Some
-        channels of such a body are computed from its quaternion, which may be stated instead.
+        `orientations` has the orientation in the model file of each floating body whose pose is
+        recorded. Some channels of such a body are computed from its quaternion, so the entries of
+        the quaternion are possible channels, too.
 
         Args:
             path: Path of the description, for messages.
@@ -332,10 +337,13 @@ class _DescriptionReader:
         self.possible_channels = {c.name: c for c in (*declared.channels, *quaternions)}
 
     def read(self) -> RecordingDescription:
-        """Read all tables.
+        """Read and check all tables.
 
         They are checked in this order: channels, inputs, constants, runs, extra columns, and
         columns that switch drives.
+
+        Raises:
+            InputError: The description is malformed; the message is one line.
         """
         path, meta, declared = self.path, self.meta, self.declared
         self._check_known_names("", meta, _TOP_LEVEL_KEYS)
@@ -347,10 +355,11 @@ class _DescriptionReader:
         channels = self.read_channels()
         orientations = self._find_orientations(channels)
         # The effect of some inputs depends on quantities that a recording does not contain.
-        reasons: Mapping[str, str] = getattr(self.system, "refused_inputs", {})
-        tables = self._get_tables("inputs", reasons)
-        for name in (name for name in reasons if name in tables):
-            raise InputError(f"{path}: input {name}: {reasons[name]}")
+        refusal_reasons: Mapping[str, str] = getattr(self.system, "refused_inputs", {})
+        input_tables = self._get_tables("inputs", refusal_reasons)
+        for name, reason in refusal_reasons.items():
+            if name in input_tables:
+                raise InputError(f"{path}: input {name}: {reason}")
         inputs = self.read_columns("input", declared.inputs)
         if not channels:
             raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
@@ -363,6 +372,7 @@ class _DescriptionReader:
         }
         extra = self._read_extra_columns()
         switches = self._read_drive_switches()
+        # A column that switches drives need not be stated as an extra column.
         extra = {**{switch.column: {"unit": "1"} for switch in switches}, **extra}
         sources = read_sources(
             path,
@@ -414,24 +424,31 @@ class _DescriptionReader:
     # -- columns
 
     def read_channels(self) -> dict[str, _Column]:
-        """Return the columns of the channels.
+        """Return the columns of the channels by name.
 
-        Poses of floating bodies are refused, with an explanation of where to state them.
+        Raises:
+            InputError: A channel is malformed, unknown, or a state of a floating body; the message
+                explains where to state the latter.
         """
         tables = self._get_tables("channels", self.pose_units)
-        for name in (name for name in self.pose_units if name in tables):
-            raise InputError(
-                f"{self.path}: channel {name}: expected a joint or a sensor, found where a body "
-                f'floats; as [extra."{name}"] the column\'s first cell says where a run begins'
-            )
+        for name in self.pose_units:
+            if name in tables:
+                raise InputError(
+                    f"{self.path}: channel {name}: expected a joint or a sensor, found where a "
+                    f'body floats; as [extra."{name}"] the column\'s first cell says where a run '
+                    "begins"
+                )
         return self.read_columns("channel", list(self.possible_channels.values()))
 
     def read_columns(self, kind: str, signals: Sequence[Channel]) -> dict[str, _Column]:
-        """Return the conversion to SI units of each column of one kind.
+        """Return the columns that the description states for channels or inputs, by signal.
 
         Args:
             kind: ``channel`` or ``input``.
             signals: signals of this kind that may be stated.
+
+        Returns:
+            Conversion to SI units and table of each column.
         """
         units = {signal.name: signal.unit for signal in signals}
         tables = self._get_tables(f"{kind}s", units)
@@ -445,7 +462,8 @@ class _DescriptionReader:
         """Check the table of one channel or input, and compute its conversion to SI units.
 
         The table states a unit, and perhaps a scale s and an offset o, such as those of an encoder.
-        With the conversion x -> g x + b of the unit, a value x of the log becomes g (s x + o) + b.
+        With the conversion y -> g y + b of the unit to the SI unit, a value x of the log becomes
+        g (s x + o) + b.
 
         Args:
             kind: ``channel`` or ``input``.
@@ -453,18 +471,19 @@ class _DescriptionReader:
             value: Table from the description.
             unit: SI unit of the signal.
         """
-        path, location, usual = self.path, f"{kind} {name}", f'unit = "{unit}"'
-        table = check_table(path, location, value, f"a table with {usual}")
+        path, location = self.path, f"{kind} {name}"
+        expected = f'unit = "{unit}"'
+        table = check_table(path, location, value, f"a table with {expected}")
         # Noise of an input is not allowed, because simulations cannot use it.
         own_keys = ("noise", "unwrap") if kind == "channel" else ("hold",)
         self._check_known_names(f"{kind}s.{name}", table, (*_COLUMN_KEYS, *own_keys))
         # The unit is required: a log in degrees without a unit would be read as radians.
         stated_unit = check_text(
-            path, location, table.get("unit"), f"{usual} or one that converts to it"
+            path, location, table.get("unit"), f"{expected} or one that converts to it"
         )
-        converted = self._compute_scale(location, stated_unit, unit)
+        unit_scale = self._compute_scale(location, stated_unit, unit)
         if not {"scale", "offset"} & table.keys():
-            return _Column(converted, table)
+            return _Column(unit_scale, table)
         factor = check_finite(path, f"{kind}s.{name}.scale", table.get("scale", 1.0))
         if factor == 0:
             raise make_error(
@@ -473,8 +492,11 @@ class _DescriptionReader:
         # The offset is in the stated unit, so that the zero of an encoder can be copied from its
         # log.
         offset = check_finite(path, f"{kind}s.{name}.offset", table.get("offset", 0.0))
-        gain = factor * converted.gain
-        return _Column(UnitScale(gain, converted.gain * offset + converted.offset), table)
+        scale = UnitScale(
+            gain=factor * unit_scale.gain,
+            offset=unit_scale.gain * offset + unit_scale.offset,
+        )
+        return _Column(scale, table)
 
     def _is_interpolated(self, name: str, column: _Column) -> bool:
         """Return whether an input is interpolated linearly between samples."""
@@ -489,8 +511,19 @@ class _DescriptionReader:
     ) -> dict[str, str]:
         """Return the channels whose whole turns are restored: angles recorded within one turn.
 
-        Such a channel has an entry `unwrap`: true, or the name of the command whose turn it shares.
-        The result has this name, or "" for true.
+        Such a channel has an entry `unwrap`: true, or the name of the command that determines its
+        turn.
+
+        Args:
+            channels: Columns of the channels.
+            inputs: Columns of the inputs.
+
+        Returns:
+            By channel, the name of the command; "" for true.
+
+        Raises:
+            InputError: The entry is of another type, the command is unknown, or the channel is not
+                an angle.
         """
         commands_by_channel = {}
         for name, column in channels.items():
@@ -500,25 +533,32 @@ class _DescriptionReader:
                 raise make_error(self.path, key, expected, value)
             if isinstance(value, str):
                 check_known_names(f"{key} of {self.path}", [value], inputs)
+            if not value:
+                continue
             unit = self.possible_channels[name].unit
-            if value and unit != "rad":
+            if unit != "rad":
                 expected = f"it with an angle alone ({name} is in {unit})"
                 raise make_error(self.path, key, expected, value)
-            if value:
-                commands_by_channel[name] = value if isinstance(value, str) else ""
+            commands_by_channel[name] = value if isinstance(value, str) else ""
         return commands_by_channel
 
     def _find_orientations(self, channels: Mapping[str, _Column]) -> dict[str, Array]:
-        """Return the bodies whose orientation is recorded as a quaternion, with that of the file.
+        """Return the floating bodies whose orientation is recorded as a quaternion.
 
-        A motion capture system, for example, records quaternions where the robot has joints; they
-        are converted relative to the orientation in the model file. Bodies without such channels
-        are left out.
+        A motion capture system, for example, records quaternions. They are converted later to
+        angles relative to the orientation in the model file. Bodies without such channels are left
+        out.
+
+        Args:
+            channels: Columns of the channels.
+
+        Returns:
+            By the floating joint of the body, its orientation in the model file, a quaternion (4,).
 
         Raises:
             InputError: A quaternion is incomplete, or the angles are recorded in addition.
         """
-        found = {}
+        orientations = {}
         for base, reference in self.orientations.items():
             names = [f"q.{base}.{entry}" for entry in QUATERNION_ENTRIES]
             missing = [name for name in names if name not in channels]
@@ -528,27 +568,30 @@ class _DescriptionReader:
                 raise InputError(
                     f"{self.path}: expected all of {', '.join(names)}, found no {missing[0]}"
                 )
-            doubled = [f"q.{base}.{angle}" for angle in ANGLES if f"q.{base}.{angle}" in channels]
-            if doubled:
+            angles = [f"q.{base}.{angle}" for angle in ANGLES if f"q.{base}.{angle}" in channels]
+            if angles:
                 raise InputError(
-                    f"{self.path}: expected {names[0]} or {doubled[0]}, found both; leave one out"
+                    f"{self.path}: expected {names[0]} or {angles[0]}, found both; leave one out"
                 )
-            found[base] = np.array(reference)
-        return found
+            orientations[base] = np.array(reference)
+        return orientations
 
     def _read_noises(
         self, channels: Mapping[str, _Column], orientations: Collection[str]
     ) -> dict[str, float]:
         """Return the standard deviation of each channel's noise where stated, in SI units.
 
-        It is stated in the unit of the column. Values beyond plausible sizes are refused, since the
-        unit is probably wrong. The noise of quaternions is replaced by that of the angles, which is
-        twice as large: a small rotation by an angle changes an entry of the quaternion by half of
-        it.
+        It is stated in the unit of the column. The noise of a quaternion is replaced by that of the
+        three angles, which is twice as large: a small rotation by an angle changes an entry of the
+        quaternion by half of it.
 
         Args:
             channels: columns of the channels.
-            orientations: bodies whose orientation is recorded as a quaternion.
+            orientations: floating joints whose orientation is recorded as a quaternion.
+
+        Raises:
+            InputError: a noise is not positive, or beyond plausible sizes, since its unit is then
+                probably wrong.
         """
         noises = {}
         for name, column in channels.items():
@@ -560,27 +603,31 @@ class _DescriptionReader:
                 raise make_error(self.path, key, "more than 0 (leave it out if unknown)", value)
             # A standard deviation has no offset and no sign.
             noises[name] = abs(column.scale.gain) * noise
-            size = self.possible_channels[name].scale
-            if not 1 / _MAX_NOISE_FACTOR < noises[name] / size < _MAX_NOISE_FACTOR:
-                expected = f"that of values of about {size:g} in SI units"
+            typical_size = self.possible_channels[name].scale
+            if not 1 / _MAX_NOISE_FACTOR < noises[name] / typical_size < _MAX_NOISE_FACTOR:
+                expected = f"that of values of about {typical_size:g} in SI units"
                 raise make_error(self.path, key, expected, value)
         for base in orientations:
-            stated = [noises.pop(f"q.{base}.{entry}", 0.0) for entry in QUATERNION_ENTRIES]
-            if max(stated) > 0:
-                noises |= {f"q.{base}.{angle}": 2.0 * max(stated) for angle in ANGLES}
+            largest = max(noises.pop(f"q.{base}.{entry}", 0.0) for entry in QUATERNION_ENTRIES)
+            if largest > 0:
+                noises |= {f"q.{base}.{angle}": 2.0 * largest for angle in ANGLES}
         return noises
 
     def _read_extra_columns(self) -> dict[str, Mapping[str, Any]]:
-        """Return the tables of the columns that belong to no channel or input."""
+        """Return the tables of the columns that belong to no channel or input, by name.
+
+        Raises:
+            InputError: A table is malformed, or has the name of a channel or an input.
+        """
         # A forgotten channel must not be accepted as an unused column.
         input_names = (signal.name for signal in self.declared.inputs)
         used_names = ["run", "t", *self.possible_channels, *input_names]
         tables = self._get_tables("extra", self.pose_units)
         for name, table in tables.items():
             if name in used_names:
-                remedy = "declare it as channel or input"
                 raise InputError(
-                    f"{self.path}: extra.{name}: is declared as a column already; {remedy}"
+                    f"{self.path}: extra.{name}: is declared as a column already; declare it as "
+                    "channel or input"
                 )
             unit = table.get("unit") if isinstance(table, dict) else None
             if not isinstance(unit, str):
@@ -599,7 +646,14 @@ class _DescriptionReader:
     # -- runs and constants
 
     def _read_run(self, name: str, value: Any) -> RunMetadata:
-        """Check the table of one run: constants, initial state, and whether it is held out."""
+        """Check the table of one run: constants, initial state, and whether it is held out.
+
+        Its folder or file is read elsewhere.
+
+        Args:
+            name: name of the run.
+            value: its entry in the description, which must be a table.
+        """
         location = f"runs.{name}"
         table = check_table(self.path, location, value)
         constant_names = [c.name for c in self.declared.constants]

@@ -49,6 +49,10 @@ class Frame(Protocol):
 def move_index_to_columns(path: Path, frame: Frame) -> Any:
     """Return the frame with ``run`` and ``t`` as columns if they are levels of its index.
 
+    Args:
+        path: Name of the frame, for messages.
+        frame: Data frame of the user, which is not changed.
+
     Raises:
         InputError: The name of a column is not a text, or is not unique.
     """
@@ -58,10 +62,10 @@ def move_index_to_columns(path: Path, frame: Frame) -> Any:
     if levels:
         indexed_frame = indexed_frame.reset_index(level=levels)
     names = list(indexed_frame.columns)
-    for place, name in enumerate(names):
+    for index, name in enumerate(names):
         if not isinstance(name, str):
             raise InputError(f"{path}: column {format_value(name)}: expected a name, found no text")
-        if name in names[:place]:
+        if name in names[:index]:
             raise InputError(f"{path}: column {format_value(name)} is given twice")
     return indexed_frame
 
@@ -75,9 +79,12 @@ def build_frame_description(
 ) -> dict[str, Any]:
     """Build the description of a frame's columns, as it would be written in `NAME.toml`.
 
-    So data frames and files are checked by the same rules. A column is the channel or input of its
-    name unless `meta` says otherwise. Its unit is taken from `units`, from `meta`, or from
-    ``frame.attrs["units"]``.
+    So data frames and files are checked by the same rules. Three steps:
+
+    1. Read what the user states in `meta`.
+    2. Assign each column that is not mentioned there by its name: a channel, an input, an initial
+       pose of a floating body, or a column that switches drives.
+    3. Add the unit of each column, from `units`, from `meta`, or from ``frame.attrs["units"]``.
 
     Args:
         path: Name of the frame, for messages.
@@ -93,30 +100,32 @@ def build_frame_description(
         InputError: A column belongs to no signal, or a unit is missing.
     """
     description: dict[str, Any] = to_toml_value(meta)
-    poses = get_floating_state_units(declared)
-    usual = {**poses, **{s.name: s.unit for s in (*declared.channels, *declared.inputs)}}
+    pose_units = get_floating_state_units(declared)
+    si_units = {**pose_units, **{s.name: s.unit for s in (*declared.channels, *declared.inputs)}}
     columns = [name for name in frame.columns if name != "run"]
     for name in units:
         # The same dict of units may be used for frames with different columns.
-        if name not in columns and name not in usual:
+        if name not in columns and name not in si_units:
             raise make_unknown_name_error(f"column in units of {path}", name, columns)
-    channels = join_nested_names(get_subtable(path, description, "channels"), usual)
-    inputs = join_nested_names(get_subtable(path, description, "inputs"), usual)
-    extra = join_nested_names(get_subtable(path, description, "extra"), poses)
+    channels = join_nested_names(get_subtable(path, description, "channels"), si_units)
+    inputs = join_nested_names(get_subtable(path, description, "inputs"), si_units)
+    extra = join_nested_names(get_subtable(path, description, "extra"), pose_units)
     time = get_subtable(path, description, "time")
     tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
 
     switches = [switch.column for switch in read_switches(path, description)]
-    stamps = _list_signal_columns("t", time)[0]
-    used_columns = {stamps, *extra}
+    time_column = _list_signal_columns("t", time)[0]
+    used_columns = {time_column, *extra}
     for name, table in (*channels.items(), *inputs.items(), *extra.items()):
         used_columns.update(_list_signal_columns(name, table))
-    for name in (name for name in columns if name not in used_columns):
+    for name in columns:
+        if name in used_columns:
+            continue
         if name in _list_names(declared.channels):
             channels[name] = {}
         elif name in _list_names(declared.inputs):
             inputs[name] = {}
-        elif name in poses:
+        elif name in pose_units:
             extra[name] = {}
         elif name in switches:
             extra[name] = {"unit": "1"}
@@ -125,13 +134,14 @@ def build_frame_description(
 
     noted_units = frame.attrs.get("units", {})
     noted_units = noted_units if isinstance(noted_units, Mapping) else {}
-    _state_unit(time, stamps, units, noted_units)
+    _state_unit(time, time_column, units, noted_units)
+    # SI unit by column for which no unit is stated, as a suggestion.
     missing = {}
     for name, table in (*channels.items(), *inputs.items(), *extra.items()):
         # Entries that are not tables are refused when the description is checked.
         column = _list_signal_columns(name, table)[0]
         if isinstance(table, dict) and not _state_unit(table, column, units, noted_units):
-            missing[column] = usual.get(name, "1")
+            missing[column] = si_units.get(name, "1")
     if missing:
         raise InputError(
             f"{path}: expected the unit of each column, found none of "
@@ -141,7 +151,9 @@ def build_frame_description(
 
 
 def _list_signal_columns(name: str, table: Any) -> list[str]:
-    """Return the columns of a signal; entries of a wrong type are refused elsewhere.
+    """Return the names of the columns of a signal, at least one.
+
+    Entries of a wrong type are left out here; they are refused when the description is checked.
 
     Args:
         name: name of the signal, which is the default column.
@@ -157,11 +169,13 @@ def _state_unit(
 ) -> bool:
     """Write the unit of a column into its table, and return whether a unit is known.
 
+    The first of these counts: `units`, the table itself, `noted_units`.
+
     Args:
         table: table of the column in the description; changed in place.
         column: name of the column.
         units: units that the caller states, by column.
-        noted_units: units that the data frame itself notes.
+        noted_units: units in the metadata of the data frame, by column.
     """
     if column in units:
         table["unit"] = units[column]
@@ -223,15 +237,23 @@ class _FrameTable(RecordingTable):
         return f"{self.path}.iloc[{record}]"
 
     def read_frame(self, frame: Frame, description: RecordingDescription) -> list[CsvRun]:
-        """Return the runs of a frame, with columns by the names of the signals."""
+        """Return the runs of a frame, with columns by the names of the signals.
+
+        Args:
+            frame: the data frame.
+            description: its checked description, which maps signals to columns.
+
+        Raises:
+            InputError: a column is missing, or has a cell of a wrong type; or a run is malformed.
+        """
         sources = description.sources
-        places = {
+        source_by_name = {
             "t": SignalSource("", (sources.time,)),
             **sources.signals,
             **sources.extra,
         }
         columns = {}
-        for name, source in places.items():
+        for name, source in source_by_name.items():
             for column in source.columns:
                 if column not in frame.columns:
                     raise self.make_missing_column_error(column, list(map(str, frame.columns)))
@@ -241,7 +263,7 @@ class _FrameTable(RecordingTable):
         return self.split_into_runs(self._run_names(frame, len(columns["t"])), columns)
 
     def _run_names(self, frame: Any, count: int) -> list[str]:
-        """Return the name of the run of each row.
+        """Return the name of the run of each row; "1" if the frame has no column ``run``.
 
         Args:
             frame: the data frame.
@@ -262,18 +284,23 @@ class _FrameTable(RecordingTable):
     def _get_values(self, name: str, frame: Any, column: str) -> Array:
         """Return a column as numbers (T,); NaN where a cell is missing.
 
+        Absolute time stamps become seconds from the first one, and time differences seconds.
+
         Args:
             name: name of the signal; ``t`` for the times.
             frame: the data frame.
             column: name of the column.
+
+        Raises:
+            InputError: a cell is not a finite number, or is missing in an input or the times.
         """
         cells = frame[column]
-        if name == "t" and cells.dtype.kind == "M":  # absolute time stamps
+        if name == "t" and cells.dtype.kind == "M":  # datetime
             cells = cells - cells.min()
-        if name == "t" and cells.dtype.kind == "m":
+        if name == "t" and cells.dtype.kind == "m":  # timedelta
             cells = cells.dt.total_seconds()
         missing = cells.isna().to_numpy()
-        if cells.dtype.kind not in "iuf":
+        if cells.dtype.kind not in "iuf":  # neither integers nor floating-point numbers
             for record, cell in enumerate(cells):
                 if not missing[record] and not is_plausible_number(cell):
                     self.raise_error(

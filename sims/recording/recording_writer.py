@@ -10,6 +10,7 @@ import io
 import math
 import os
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -63,12 +64,15 @@ def format_table(runs: Sequence[Run], digits: int) -> str:
     Args:
         runs: Runs with the same signals; those of the first determine the columns.
         digits: Number of significant digits.
+
+    Raises:
+        InputError: Two runs have the same name, or different signals.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    # The columns are those of the first run, and all other runs must have the same.
+    # Names of the signals by the attribute of a run that holds them.
     names = {kind: list(getattr(runs[0], kind)) for kind in ("inputs", "channels", "extra")}
-    writer.writerow(["run", "t", *(name for of_kind in names.values() for name in of_kind)])
+    writer.writerow(["run", "t", *chain.from_iterable(names.values())])
     run_names: set[str] = set()
     for run in runs:
         if run.name in run_names:
@@ -102,18 +106,17 @@ def _format_cells(values: Array, digits: int) -> list[str]:
         values: (T,) numbers of the column, NaN where missing.
         digits: significant digits of each cell.
     """
-    # repr gives the shortest text that is read back as the same number; a missing sample is an
-    # empty cell.
-    shortest = repr if digits >= _LOSSLESS_DIGITS else f"{{:.{digits}g}}".format
-    return [shortest(v) if math.isfinite(v) else "" for v in values.tolist()]
+    # repr gives the shortest text that is read back as the same number.
+    format_number = repr if digits >= _LOSSLESS_DIGITS else f"{{:.{digits}g}}".format
+    return [format_number(v) if math.isfinite(v) else "" for v in values.tolist()]
 
 
 def _describe_source(recording: Recording, folder: Path) -> dict[str, Any]:
-    """Return the keys that state what was recorded: a system, or a model file.
+    """Return the entries of a description that state what was recorded: a system, or a model file.
 
     Args:
         recording: Recording.
-        folder: Folder to which the path of the model file is relative.
+        folder: Folder of the description, to which the path of the model file is relative.
     """
     model = recording.model
     if model is None:
@@ -122,38 +125,47 @@ def _describe_source(recording: Recording, folder: Path) -> dict[str, Any]:
         file = os.path.relpath(model.path, folder)
     except ValueError:  # on another drive
         file = str(model.path.resolve())
-    model_entries = {"actuators": model.actuators, "engine": model.engine}
-    return {"model": Path(file).as_posix(), **{k: dict(v) for k, v in model_entries.items() if v}}
+    entries: dict[str, Any] = {"model": Path(file).as_posix()}
+    for name, table in (("actuators", model.actuators), ("engine", model.engine)):
+        if table:
+            entries[name] = dict(table)
+    return entries
 
 
 def format_description(recording: Recording, declared: DeclaredSignals, folder: Path) -> str:
     """Return the text of the description in TOML: units, constants, and what is known of each run.
 
-    `folder` is the folder of the recording; a model file is stated relative to it.
+    Entries that would be empty or have the default value are left out.
+
+    Args:
+        recording: Recording to describe; its first run determines the signals.
+        declared: System of the recording, or simulator of it, for the units.
+        folder: Folder of the description, to which the path of the model file is relative.
     """
     import tomli_w
 
-    units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}
+    units = {signal.name: signal.unit for signal in (*declared.inputs, *declared.channels)}
     first_run = recording.runs[0]
     document: dict[str, Any] = {**_describe_source(recording, folder), "title": recording.title}
-    document["channels"] = {n: {"unit": units[n]} for n in first_run.channels}
+    document["channels"] = {name: {"unit": units[name]} for name in first_run.channels}
     for name in recording.noise.keys() & first_run.channels.keys():
         if recording.noise[name]:
             document["channels"][name]["noise"] = recording.noise[name]
     if first_run.inputs:
-        document["inputs"] = {
-            n: {"unit": units[n], **({"hold": "linear"} if n in first_run.linear else {})}
-            for n in first_run.inputs
-        }
+        document["inputs"] = {name: {"unit": units[name]} for name in first_run.inputs}
+        for name in first_run.linear & first_run.inputs.keys():
+            document["inputs"][name]["hold"] = "linear"
     if first_run.offset:
         document["time"] = {"offset": first_run.offset}
     if first_run.extra:
-        document["extra"] = {n: {"unit": recording.extra.get(n, "1")} for n in first_run.extra}
+        document["extra"] = {
+            name: {"unit": recording.extra.get(name, "1")} for name in first_run.extra
+        }
     if recording.constants:
         document["constants"] = dict(recording.constants)
-    runs = {run.name: _describe_run(run) for run in recording.runs}
-    if any(runs.values()):
-        document["runs"] = {name: marks for name, marks in runs.items() if marks}
+    run_entries = {run.name: _describe_run(run) for run in recording.runs}
+    if any(run_entries.values()):
+        document["runs"] = {name: entries for name, entries in run_entries.items() if entries}
     return tomli_w.dumps(document)
 
 

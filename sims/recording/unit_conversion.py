@@ -55,6 +55,7 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
     """
     if unit == target:
         return IDENTITY_SCALE
+    # Other texts could keep the parser busy for ever.
     if len(unit) > _MAX_UNIT_LENGTH or not _is_simple_unit(unit):
         raise InputError(
             f"expected a unit that converts to {target}, found {unit[:_MAX_UNIT_LENGTH]!r}"
@@ -108,16 +109,21 @@ def _is_simple_unit(unit: str) -> bool:
 
     A simple unit consists of names and 1, joined by * / or spaces, each with at most one small
     power. A text such as 9**9**9 would keep the parser busy for ever.
+
+    Args:
+        unit: text of any kind; an empty one is not simple.
     """
-    position, previous_token = 0, "operator"
+    # The beginning counts as an operator, since neither a power nor the end may follow it.
+    position, previous_kind = 0, "operator"
     while position < len(unit):
         token = _TOKEN.match(unit, position)
-        if token is None or (
-            token.lastgroup == "power" and previous_token in ("power", "operator")
-        ):
+        if token is None:
             return False
-        position, previous_token = token.end(), str(token.lastgroup)
-    return previous_token != "operator"
+        kind = str(token.lastgroup)
+        if kind == "power" and previous_kind in ("power", "operator"):
+            return False
+        position, previous_kind = token.end(), kind
+    return previous_kind != "operator"
 
 
 @lru_cache(maxsize=1)
@@ -140,15 +146,15 @@ def _get_unit_registry() -> Any:
 
 
 def unwrapped(positions: Array, command: Array | None = None) -> Array:
-    """Restore the whole turns of a position that was recorded within one turn; NaN stays NaN.
+    """Restore the whole turns of an angle that was recorded within one turn; NaN stays NaN.
 
     Jumps of more than half a turn between samples are removed. The first sample may still be off by
     whole turns; with a command, the position is moved to the turn of the command.
 
     Args:
         positions: (T,) positions, rad.
-        command: (T,) command of the joint's position servo, rad, which determines the turn; None if
-            there is none.
+        command: (T,) command of the joint's position servo, rad, which the position follows; None
+            if there is none.
 
     Returns:
         (T,) positions, rad.
@@ -157,6 +163,6 @@ def unwrapped(positions: Array, command: Array | None = None) -> Array:
     finite = np.isfinite(positions)
     result[finite] = np.unwrap(positions[finite])
     if command is not None and finite.any():
-        difference = float(np.mean((command - result)[finite]))
-        result += 2.0 * math.pi * round(difference / (2.0 * math.pi))
+        mean_difference = float(np.mean((command - result)[finite]))
+        result += 2.0 * math.pi * round(mean_difference / (2.0 * math.pi))
     return result
