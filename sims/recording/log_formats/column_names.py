@@ -18,7 +18,7 @@ from sims.core.simulator import Array, make_read_only
 
 _NAMES_WORD = r"(?:joint[_ ]?|motor[_ ]?)?names?"
 _NUMBERED_COLUMN_PATTERN = re.compile(
-    r"(?P<stem>.*?)(?P<left>[\[(._]?)(?P<place>\d{1,4})(?P<right>[\])]?)"
+    r"(?P<stem>.*?)(?P<left>[\[(._]?)(?P<number>\d{1,4})(?P<right>[\])]?)"
 )
 _NAMES_COLUMN = re.compile(rf"(?:(?P<prefix>.*?)[._/ ])??{_NAMES_WORD}", re.IGNORECASE)
 _LIST_OF_TEXTS = re.compile(r"[\[(](?P<inside>.*)[\])]")
@@ -30,41 +30,41 @@ def name_numbered_columns(
     """Name the numbered columns of a table by the columns that hold their names.
 
     ROS logs, for example, have columns ``name[0]``, ``name[1]``, ... with names of joints and
-    ``position[0]``, ``position[1]``, ... with numbers. Names are looked up in each row, because
-    some loggers change their order.
+    ``position[0]``, ``position[1]``, ... with numbers. The column of the joint elbow is then
+    ``position.elbow``. Names are looked up in each row, because some loggers change their order.
+    Columns of names belong to columns of numbers with the same prefix, brackets and numbers.
 
     Args:
         columns: Numbers (T,) by column name.
         texts: Texts (T,) by column name.
 
     Returns:
-        The numbers by the names of their joints, and the numbered columns that they replace.
+        The numbers (T,) by the new names, and the numbered columns that they replace.
     """
-    groups: dict[tuple[str, str, str], dict[int, str]] = {}
+    # Columns of names by their numbers, for each prefix, opening and closing bracket.
+    name_columns: dict[tuple[str, str, str], dict[int, str]] = {}
     for column in texts:
         match = _NUMBERED_COLUMN_PATTERN.fullmatch(column)
-        stem = _NAMES_COLUMN.fullmatch(match["stem"]) if match else None
-        if match and stem:
-            prefix = column[: len(stem["prefix"]) + 1] if stem["prefix"] else ""
+        names_match = _NAMES_COLUMN.fullmatch(match["stem"]) if match else None
+        if match and names_match:
+            # The prefix includes the character after it, as in `left.` of `left.name[0]`.
+            prefix = column[: len(names_match["prefix"]) + 1] if names_match["prefix"] else ""
             style = prefix, match["left"], match["right"]
-            groups.setdefault(style, {})[int(match["place"])] = column
+            name_columns.setdefault(style, {})[int(match["number"])] = column
     named_columns: dict[str, Array] = {}
-    unlisted: set[str] = set()
-    for style, columns_by_position in groups.items():
-        names = [
-            list(texts[columns_by_position[position]]) for position in sorted(columns_by_position)
-        ]
-        for siblings, columns_by_number in _group_numbered_columns(columns, *style).items():
-            if set(columns_by_number) != set(columns_by_position):
+    replaced: set[str] = set()
+    for style, names_by_number in name_columns.items():
+        numbers = sorted(names_by_number)
+        names = [list(texts[names_by_number[number]]) for number in numbers]
+        for stem, columns_by_number in _group_numbered_columns(columns, *style).items():
+            if columns_by_number.keys() != names_by_number.keys():
                 continue
-            values = np.column_stack(
-                [columns[columns_by_number[position]] for position in sorted(columns_by_number)]
-            )
-            entries = _sort_by_name(values, names, f"{siblings}.")
+            values = np.column_stack([columns[columns_by_number[number]] for number in numbers])
+            entries = _sort_by_name(values, names, f"{stem}.")
             if entries and not entries.keys() & columns.keys():
                 named_columns |= entries
-                unlisted |= set(columns_by_number.values())
-    return named_columns, frozenset(unlisted)
+                replaced |= set(columns_by_number.values())
+    return named_columns, frozenset(replaced)
 
 
 def name_list_entries(
@@ -72,28 +72,33 @@ def name_list_entries(
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Name the entries of lists by a column that holds a list of names in each row.
 
+    A cell of names is ``['base', 'elbow']``. Each column of lists with as many entries is divided
+    into columns such as ``position.elbow``; the names are looked up in each row.
+
     Args:
         columns: Numbers (T,) or (T, k) by column name.
         texts: Texts (T,) by column name.
 
     Returns:
-        The numbers by the names of their joints, and the lists that they replace.
+        The numbers (T,) by the new names, and the columns of lists that they replace.
     """
     named_columns: dict[str, Array] = {}
-    unlisted: set[str] = set()
+    replaced: set[str] = set()
     for names_column, cells in texts.items():
-        stem = _NAMES_COLUMN.fullmatch(names_column)
-        lists = [_parse_text_list(cell) for cell in cells] if stem else []
-        if not lists or not lists[0] or len({len(name_list) for name_list in lists}) > 1:
+        if not _NAMES_COLUMN.fullmatch(names_column):
             continue
-        names = [list(entry_names) for entry_names in zip(*lists, strict=True)]
+        name_lists = [_parse_text_list(cell) for cell in cells]
+        # The first row must have names, and all others as many.
+        if not name_lists or not name_lists[0] or len(set(map(len, name_lists))) > 1:
+            continue
+        names = [list(entry_names) for entry_names in zip(*name_lists, strict=True)]
         for name, values in columns.items():
             if values.ndim == 2 and values.shape[1] == len(names):
                 entries = _sort_by_name(values, names, f"{name}.")
                 if entries and not entries.keys() & columns.keys():
                     named_columns |= entries
-                    unlisted.add(name)
-    return named_columns, frozenset(unlisted)
+                    replaced.add(name)
+    return named_columns, frozenset(replaced)
 
 
 def name_array_entries(
@@ -101,16 +106,20 @@ def name_array_entries(
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Name the entries of arrays by an array of names of the same length.
 
+    Each array (T, k) with as many columns as there are names is divided into columns such as
+    ``position.elbow``.
+
     Args:
         columns: Numbers (T,) or (T, k) by array name.
         names: Texts (k,) by array name.
 
     Returns:
-        The numbers by the names of their joints, and the arrays that they replace.
+        The numbers (T,) by the new names, and the arrays that they replace.
     """
     named_columns: dict[str, Array] = {}
-    unlisted: set[str] = set()
+    replaced: set[str] = set()
     for array, entry_names in names.items():
+        # Other arrays of texts are no names of columns.
         if not re.search(r"name|joint|motor|label", array, re.IGNORECASE):
             continue
         for name, values in columns.items():
@@ -119,23 +128,23 @@ def name_array_entries(
                     f"{name}.{entry_name}": make_read_only(values[:, k])
                     for k, entry_name in enumerate(entry_names)
                 }
-                unlisted.add(name)
-    return named_columns, frozenset(unlisted)
+                replaced.add(name)
+    return named_columns, frozenset(replaced)
 
 
 def _group_numbered_columns(
     columns: Mapping[str, Array], prefix: str, opening: str, closing: str
 ) -> dict[str, dict[int, str]]:
-    """Group numbered columns by the text before their number.
+    """Group numbered columns, such as ``position[0]``, by the text before their number.
 
     Args:
         columns: Numbers by column name.
         prefix: Required beginning of the names.
-        opening: Required character before the number.
-        closing: Required character after the number.
+        opening: Required character before the number, such as ``[``; empty for none.
+        closing: Required character after the number; empty for none.
 
     Returns:
-        Column names by number, for each text before the number.
+        Column names by number, for each text before the number (without the opening character).
     """
     columns_by_stem: dict[str, dict[int, str]] = {}
     for column, values in columns.items():
@@ -143,23 +152,21 @@ def _group_numbered_columns(
         if match is None or values.ndim > 1 or not column.startswith(prefix):
             continue
         if (match["left"], match["right"]) == (opening, closing):
-            columns_by_stem.setdefault(match["stem"], {})[int(match["place"])] = column
+            columns_by_stem.setdefault(match["stem"], {})[int(match["number"])] = column
     return columns_by_stem
 
 
 def _sort_by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict[str, Array]:
     """Sort numbers into columns by name, looking up the names in each row.
 
-    Texts that differ in most rows are not names; then nothing is sorted.
-
     Args:
         values: Numbers (T, k).
-        names: Names (k, T), one for each number in each row.
+        names: Names (k, T), one for each number in each row; some may be empty.
         prefix: Beginning of the names of the new columns.
 
     Returns:
         Columns (T,) by name, NaN in rows without the name; empty if a row has a name twice, or if
-        there are far more names than columns.
+        there are far more different texts than columns, which are then not names.
     """
     distinct_names = list(dict.fromkeys(name for column in names for name in column if name))
     if not distinct_names or len(distinct_names) > 4 * len(names):
@@ -168,14 +175,13 @@ def _sort_by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) ->
     columns: dict[str, Array] = {}
     for name in distinct_names:
         mask = table == name
-        if (mask.sum(axis=1) > 1).any():
+        counts = mask.sum(axis=1)
+        if (counts > 1).any():
             return {}
-        columns[prefix + name] = make_read_only(np.where(mask, values, 0.0).sum(axis=1))
-        missing = ~mask.any(axis=1)
-        if missing.any():
-            column = columns[prefix + name].copy()
-            column[missing] = np.nan
-            columns[prefix + name] = make_read_only(column)
+        # Each row has one number with this name, or none.
+        column = np.where(mask, values, 0.0).sum(axis=1)
+        column[counts == 0] = np.nan
+        columns[prefix + name] = make_read_only(column)
     return columns
 
 

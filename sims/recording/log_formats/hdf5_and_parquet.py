@@ -22,6 +22,9 @@ from sims.recording.log_formats.log_columns import MAX_COLUMNS, convert_read_err
 def read_numeric_columns(table: Any) -> tuple[dict[str, Array], list[str]]:
     """Read the numeric columns of a pyarrow table.
 
+    Args:
+        table: Table of pyarrow.
+
     Returns:
         Numbers by column name, (T,) or (T, k), and the names of the columns without numbers.
     """
@@ -56,29 +59,29 @@ def _is_list(kind: Any) -> bool:
 
 
 def _convert_to_numbers(column: Any) -> Array | None:
-    """Return the numbers (T,) or (T, k) of a column; None if it holds none.
+    """Return the numbers of a column as floats; None if it holds none.
 
-    Lists become k columns if all have the same length. Time stamps become integers in their own
-    unit.
+    Time stamps become integers in their own unit, and booleans 0 and 1.
 
     Args:
         column: Column of a pyarrow table.
+
+    Returns:
+        (T,) numbers, or (T, k) for lists of numbers, which must all have the same length k.
     """
     import pyarrow
 
-    kind = column.type
-    if pyarrow.types.is_timestamp(kind):
+    types = pyarrow.types
+    if types.is_timestamp(column.type):
         column = column.cast(pyarrow.int64())
-        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
-    if pyarrow.types.is_boolean(kind):
+    elif types.is_boolean(column.type):
         column = column.cast(pyarrow.int8())
-        kind = column.type
-    if pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind):
+    if types.is_integer(column.type) or types.is_floating(column.type):
         return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
-    if not _is_list(kind):
+    if not _is_list(column.type):
         return None
     rows = column.to_pylist()
-    lengths = {len(row) if row is not None else -1 for row in rows}
+    lengths = {len(row) if row is not None else -1 for row in rows}  # -1 for a missing list
     if len(lengths) != 1 or not 0 < max(lengths) <= MAX_COLUMNS:
         return None
     try:
@@ -100,7 +103,10 @@ def is_hdf5(path: Path) -> bool:
 
 
 def split_group_path(path: Path) -> tuple[Path, str] | None:
-    """Split a path into an HDF5 file and a group in it; None if it is not inside such a file."""
+    """Split a path into an HDF5 file and a group in it; None if it is not inside such a file.
+
+    The group of the file itself is ``/``.
+    """
     if is_hdf5(path):
         return path, "/"
     for parent in path.parents:
@@ -113,30 +119,33 @@ def list_run_paths(path: Path) -> list[Path]:
     """List the log of each run of a file: its numbered groups, or the file itself.
 
     Datasets of robot learning have groups such as ``data/demo_0``, ``data/demo_1``, one for a run.
+    All groups at the top level or in ``data`` must be numbered; else the file is one run.
+
+    Args:
+        path: HDF5 file.
 
     Raises:
         InputError: The file cannot be read, or h5py is not installed.
     """
     with _open_file(path) as file:
-        for name in ("", "data"):
-            group = file.get(name or "/")
-            groups = [key for key, entry in _list_members(group) if hasattr(entry, "items")]
-            runs = [key for key in groups if _RUN_NAME_PATTERN.fullmatch(key)]
-            if runs and len(runs) == len(groups):
-                return [path / name / run for run in sorted(runs, key=_make_natural_sort_key)]
+        for parent in ("", "data"):
+            members = _list_members(file.get(parent or "/"))
+            groups = [name for name, member in members if hasattr(member, "items")]
+            if groups and all(map(_RUN_NAME_PATTERN.fullmatch, groups)):
+                return [path / parent / run for run in sorted(groups, key=_make_natural_sort_key)]
     return [path]
 
 
 def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list[str]]]:
-    """Read the datasets of a group.
+    """Read the datasets of a group and of the groups in it.
 
     Args:
         path: HDF5 file.
         group: Path of the group in it.
 
     Returns:
-        Numbers by dataset name, (T,) or (T, k), and the texts of each other dataset, empty where it
-        holds something else.
+        Numbers by the path of their dataset in the group, (T,) or (T, k); and the texts of each
+        other dataset, empty where it holds neither numbers nor a list of texts.
 
     Raises:
         InputError: There is no such group, or the file cannot be read.
@@ -154,8 +163,9 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
             # A name that is not UTF-8 comes as bytes.
             if not hasattr(dataset, "dtype") or not isinstance(name, str):
                 continue
+            is_numeric = dataset.dtype.kind in "fiub"  # floats, integers and booleans
             is_wide = dataset.ndim > 1 and dataset.shape[1] > MAX_COLUMNS
-            if dataset.dtype.kind not in "fiub" or dataset.ndim not in (1, 2) or is_wide:
+            if not is_numeric or dataset.ndim not in (1, 2) or is_wide:
                 texts[name] = _read_texts(dataset)
             elif dataset.size > MAX_DATASET_ENTRIES:
                 raise InputError(f"{path}: {name} has {dataset.size} entries; at most 250 million")
@@ -169,7 +179,10 @@ def _open_file(path: Path) -> Iterator[Any]:
     """Open an HDF5 file, and convert the errors of its reader to one line.
 
     Args:
-        path: HDF5 file; the package h5py is optional.
+        path: HDF5 file.
+
+    Raises:
+        InputError: The optional package h5py is not installed, or the file cannot be read.
     """
     try:
         import h5py

@@ -60,7 +60,7 @@ def list_episodes(dataset: Path) -> list[Path]:
 
 
 def list_episode_files(dataset: Path, episode: int) -> list[Path]:
-    """List the files that hold an episode, after the file ``meta/info.json``.
+    """List the files that hold an episode: ``meta/info.json``, then its Parquet files.
 
     Args:
         dataset: Folder of the dataset.
@@ -79,7 +79,8 @@ def list_episode_files(dataset: Path, episode: int) -> list[Path]:
 def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[str]]:
     """Read an episode of a dataset: its rows in all files that have some, without images.
 
-    Columns of lists whose entries the dataset names become a column for each entry.
+    A column of lists whose entries the dataset names becomes a column for each entry, such as
+    ``observation.state.elbow_flex.pos``.
 
     Args:
         dataset: Folder of the dataset.
@@ -102,8 +103,8 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
             column_names = [
                 field.name for field in parquet.read_schema(file) if is_numeric_type(field.type)
             ]
-            rows = [(EPISODE_COLUMN, "==", episode)]
-            parts.append(parquet.read_table(file, columns=column_names, filters=rows))
+            row_filter = [(EPISODE_COLUMN, "==", episode)]
+            parts.append(parquet.read_table(file, columns=column_names, filters=row_filter))
             table = pyarrow.concat_tables(parts)
     numeric_columns, texts = read_numeric_columns(table)
     columns: dict[str, Array] = {}
@@ -119,26 +120,22 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
 
 
 def _list_feature_names(info_file: Path, feature: str) -> list[str]:
-    """Return the names of the entries of a feature; empty where the dataset states none.
+    """Return the names of the entries of a feature (a column); empty where none are stated.
 
     Args:
         info_file: path of ``meta/info.json``.
         feature: name of the feature, such as ``observation.state``.
     """
     try:
-        entry_names = json.loads(info_file.read_text(encoding="utf-8"))["features"][feature][
-            "names"
-        ]
+        info = json.loads(info_file.read_text(encoding="utf-8"))
+        entry_names = info["features"][feature]["names"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
     # Some datasets group the names by kind: {"motors": [...]}.
     if isinstance(entry_names, dict) and len(entry_names) == 1:
         (entry_names,) = entry_names.values()
-    if isinstance(entry_names, list) and all(
-        isinstance(entry_name, str) for entry_name in entry_names
-    ):
-        return entry_names
-    return []
+    is_list = isinstance(entry_names, list)
+    return entry_names if is_list and all(isinstance(name, str) for name in entry_names) else []
 
 
 def _find_episode_files(dataset: Path) -> dict[int, list[Path]]:
@@ -150,10 +147,11 @@ def _find_episode_files(dataset: Path) -> dict[int, list[Path]]:
 
 @lru_cache(maxsize=8)
 def _find_cached_episode_files(stamps: tuple[tuple[Path, int, int], ...]) -> dict[int, list[Path]]:
-    """Return the files that hold each episode; cached for unchanged files.
+    """Return the files that hold each episode, by episode number; cached for unchanged files.
 
     Args:
-        stamps: Path, time of last change (ns) and size (bytes) of each file.
+        stamps: Path, time of last change (ns) and size (bytes) of each file. The last two are part
+            of the cache key only.
     """
     import pyarrow.parquet as parquet
 
@@ -181,13 +179,14 @@ class MotorRange(NamedTuple):
 
 
 def read_calibration(path: Path) -> dict[str, MotorRange]:
-    """Read the ranges of all motors from a calibration file.
+    """Read the ranges of all motors from a calibration file of LeRobot.
 
-    The file states which positions of a motor, in encoder counts, are the ends of the
-    normalised range.
+    The file states which positions of a motor, in encoder counts, are the ends of the normalised
+    range, and whether its sign is reversed (``drive_mode``).
 
     Raises:
-        InputError: The file is not a calibration file of LeRobot; the message is one line.
+        InputError: The file is not a calibration file, or a range is empty; the message is one
+            line.
     """
     require_file(path)
     try:
@@ -226,8 +225,9 @@ def find_calibration(folders: Iterable[Path]) -> Path | None:
             continue
         for path in sorted(folder.glob("*.json")):
             try:
-                small = path.stat().st_size <= MAX_FILE_BYTES
-                document = json.loads(path.read_text(encoding="utf-8-sig")) if small else None
+                if path.stat().st_size > MAX_FILE_BYTES:
+                    continue
+                document = json.loads(path.read_text(encoding="utf-8-sig"))
             except (OSError, ValueError, RecursionError):
                 continue
             if _get_motor_tables(document) is not None:
@@ -236,7 +236,9 @@ def find_calibration(folders: Iterable[Path]) -> Path | None:
 
 
 def _get_motor_tables(document: Any) -> Mapping[str, Mapping[str, Any]] | None:
-    """Return the tables of the motors; None if the document is not a calibration.
+    """Return the tables of the motors by name; None if the document is not a calibration.
+
+    It is one if each entry is a table with the numbers `range_min` and `range_max`.
 
     Args:
         document: Content of a JSON file.

@@ -12,7 +12,7 @@ from sims.core.simulator import Array, InputError, make_read_only
 
 MAX_COLUMNS = 10_000
 """Maximum number of columns of a log, and of entries of a list in a cell."""
-_LIST_ENTRY_PATTERN = re.compile(r"(?P<base>.*)\[(?P<place>\d{1,5})\]")
+_LIST_ENTRY_PATTERN = re.compile(r"(?P<base>.*)\[(?P<index>\d{1,5})\]")
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,12 @@ class LogFile:
     def get_column(self, name: str) -> Array:
         """Return one column (T,), or one entry of a column of lists, such as ``position[2]``.
 
+        Args:
+            name: Name as a description or a user wrote it; case does not count.
+
         Raises:
-            InputError: There is no such column; the message is one line.
+            InputError: There is no such column or entry, or the column contains lists and the name
+                no index; the message is one line.
         """
         if name in self.columns:
             values = self.columns[name]
@@ -54,13 +58,13 @@ class LogFile:
             last = values.shape[1] - 1
             entries = f"its entries are {name}[0] to {name}[{last}]"
             raise InputError(f"{self.path}: column '{name}' contains lists; {entries}")
-        base, place = self._find_column(name)
-        values = self.columns[base]
-        if place is None and values.ndim == 1:
+        column, index = self._find_column(name)
+        values = self.columns[column]
+        if index is None and values.ndim == 1:
             return values
-        if place is None or values.ndim == 1 or place >= values.shape[1]:
+        if index is None or values.ndim == 1 or index >= values.shape[1]:
             raise self._make_missing_column_error(name)
-        return make_read_only(values[:, place])
+        return make_read_only(values[:, index])
 
     def _find_column(self, name: str) -> tuple[str, int | None]:
         """Find a column regardless of case, and the index into its lists if the name has one.
@@ -72,18 +76,21 @@ class LogFile:
 
         Returns:
             Name in the file, and the index of the list entry, else None.
+
+        Raises:
+            InputError: No column has this name, or several have it in different case.
         """
+        candidates: list[tuple[str, int | None]] = [(name, None)]
         match = _LIST_ENTRY_PATTERN.fullmatch(name)
-        for base, entry in (
-            ((name, None), (match["base"], int(match["place"]))) if match else ((name, None),)
-        ):
-            matches = [
-                column for column in self.columns if column.strip().lower() == base.strip().lower()
-            ]
-            if base in self.columns:
-                return base, entry
+        if match:
+            candidates.append((match["base"], int(match["index"])))
+        for candidate, index in candidates:
+            if candidate in self.columns:
+                return candidate, index
+            lower_case = candidate.strip().lower()
+            matches = [column for column in self.columns if column.strip().lower() == lower_case]
             if len(matches) == 1:
-                return matches[0], entry
+                return matches[0], index
         raise self._make_missing_column_error(name)
 
     def _make_missing_column_error(self, name: str) -> InputError:
@@ -94,7 +101,10 @@ class LogFile:
         return InputError(f"{self.path}: unknown column '{name}'; there are: {column_list}")
 
     def list_columns(self) -> list[str]:
-        """List all numeric columns; columns of lists by their entries."""
+        """List all numeric columns; columns of lists by their entries, ``position[0]`` and so on.
+
+        Columns are left out that another one replaces under the name of a joint.
+        """
         column_names = []
         for name, values in self.columns.items():
             if name in self.unlisted:
@@ -108,11 +118,13 @@ class LogFile:
 
 @contextmanager
 def convert_read_errors(path: Path, kind: str, hint: str = "") -> Iterator[None]:
-    """Convert all errors of the library that reads a file.
+    """Convert all errors of the library that reads a file to an error of one line.
+
+    It is used in a ``with`` statement around the calls of the library.
 
     Args:
         path: Path of the file.
-        kind: Kind of the file with its article, for the message.
+        kind: Kind of the file with its article, for the message, such as "an HDF5 file".
         hint: Advice at the end of the message.
 
     Raises:

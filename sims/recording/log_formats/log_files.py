@@ -44,33 +44,35 @@ MAX_FILE_BYTES = 2_000_000_000
 def read_log(path: str | Path, columns_to_read: frozenset[str] = frozenset()) -> LogFile:
     """Read the columns of a log file in any supported format.
 
-    The path may name a file, a topic of a ROS bag, an episode of a LeRobot dataset, or a group in
-    an HDF5 file. Logs are cached by path, size and modification time.
+    The path may name a topic of a ROS bag, an episode of a LeRobot dataset, a group in an HDF5
+    file, or a file. Logs are cached by path, size and modification time.
 
     Args:
         path: Path of the log.
-        columns_to_read: Columns that will be used; all if empty. Of a bag, which may be larger than
-            the memory, only these are stored if it has all of them.
+        columns_to_read: Columns that will be used; all if empty. They matter only for a bag, which
+            may be larger than the memory: only these are stored, if it has all of them.
 
     Raises:
         InputError: The log cannot be read; the message is one line.
     """
     path = Path(path)
-    bag = ros_bags.split_bag_path(path)
-    if bag is not None:
-        log = _read_files([bag[0]], _read_topic, path, *bag, columns_to_read)
+    bag_and_topic = ros_bags.split_bag_path(path)
+    if bag_and_topic is not None:
+        bag, topic = bag_and_topic
+        log = _read_files([bag], _read_topic, path, bag, topic, columns_to_read)
         column_names = {name.lower() for name in log.columns}
-        # The error for a missing column lists all columns of the log.
         if {name.strip().lower() for name in columns_to_read} <= column_names:
             return log
-        return _read_files([bag[0]], _read_topic, path, *bag)
+        # All columns are read, because the error for a missing one lists them.
+        return _read_files([bag], _read_topic, path, bag, topic)
     episode = lerobot_dataset.split_episode_path(path)
     if episode is not None:
         files = lerobot_dataset.list_episode_files(*episode)
         return _read_files(files, _read_episode, path, *episode)
-    group = hdf5_and_parquet.split_group_path(path)
-    if group is not None:
-        return _read_files([group[0]], _read_group, path, *group)
+    file_and_group = hdf5_and_parquet.split_group_path(path)
+    if file_and_group is not None:
+        file, group = file_and_group
+        return _read_files([file], _read_group, path, file, group)
     if ros_bags.is_bag(path):
         topics = ", ".join(ros_bags.list_topics(path))
         raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {topics}")
@@ -97,25 +99,28 @@ def _read_files(
         arguments: Further arguments of the function.
     """
     file_stats = [file.stat() for file in files]
-    changed = max(file_stat.st_mtime_ns for file_stat in file_stats)
+    last_change = max(file_stat.st_mtime_ns for file_stat in file_stats)
     size = sum(file_stat.st_size for file_stat in file_stats)
-    return _read_version(changed, size, read, path, *arguments)
+    return _read_version(last_change, size, read, path, *arguments)
 
 
 @lru_cache(maxsize=16)
 def _read_version(
-    changed: int, size: int, read: Callable[..., LogFile], path: Path, *arguments: Any
+    last_change: int, size: int, read: Callable[..., LogFile], path: Path, *arguments: Any
 ) -> LogFile:
     """Read a log; cached by the version of its files, because logs are requested by column.
 
     Args:
-        changed: Time of the last change of its files in nanoseconds.
-        size: Their size in bytes.
+        last_change: Time of the last change of its files in nanoseconds, part of the cache key.
+        size: Their size in bytes, part of the cache key.
         read: Function that reads the log.
         path: Path of the log, the first argument of the function.
         arguments: Further arguments of the function.
+
+    Raises:
+        InputError: The log cannot be read, or has no numbers.
     """
-    del changed, size  # part of the cache key
+    del last_change, size
     try:
         log = read(path, *arguments)
     except OSError as error:
@@ -136,9 +141,14 @@ def _read_topic(
         bag: Path of the bag.
         topic: Name of the topic in the bag.
         columns_to_read: Columns to store; all if empty.
+
+    Raises:
+        InputError: The topic has no messages, or its messages have no numbers.
     """
     columns = ros_bags.read_topic(bag, topic, columns_to_read)
-    if (len(columns) < 2 and not columns_to_read) or not columns[TIME_COLUMN].size:
+    # The time stamps are always a column.
+    has_only_stamps = len(columns) < 2 and not columns_to_read
+    if has_only_stamps or not columns[TIME_COLUMN].size:
         raise InputError(f"{path}: expected messages with numbers, found none")
     return LogFile(path, columns, (), "message")
 
@@ -169,11 +179,11 @@ def _read_npz(path: Path) -> LogFile:
     ):
         for name in arrays.files:
             values = arrays[name]
-            if values.dtype.kind not in "fiub" or not 1 <= values.ndim <= 2:
+            if values.dtype.kind in "fiub" and values.ndim in (1, 2):  # numbers and booleans
+                columns[name] = make_read_only(values.astype(np.float64))
+            else:
                 is_text_list = values.dtype.kind == "U" and values.ndim == 1
                 texts[name] = values.tolist() if is_text_list else []
-            else:
-                columns[name] = make_read_only(values.astype(np.float64))
     return _make_array_log(path, columns, texts)
 
 
@@ -183,16 +193,15 @@ def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list
     Args:
         path: the file.
         columns: numbers (T,) or (T, k) by the name of their array.
-        texts: lists of texts in the file, by their name. A list with as many texts as a matrix has
-            columns, such as joint names, names each of these columns.
+        texts: lists of texts by the name of their array, empty for arrays of another type. A list
+            with as many texts as a matrix has columns, such as joint names, names these columns.
 
     Returns:
         The log. Its messages call a row "entry" and count from 0. A matrix whose columns are named
-        so can still be read, but is left out of lists of columns.
+        can still be read by its own name, but is left out of lists of columns.
     """
-    named_columns, unlisted = name_array_entries(
-        columns, {name: name_list for name, name_list in texts.items() if name_list}
-    )
+    lists_of_texts = {name: text_list for name, text_list in texts.items() if text_list}
+    named_columns, unlisted = name_array_entries(columns, lists_of_texts)
     return LogFile(
         path, {**columns, **named_columns}, tuple(texts), "entry", unlisted=unlisted, first=0
     )
@@ -229,7 +238,7 @@ _READERS: Mapping[str, Callable[[Path], LogFile]] = {
 
 
 def list_logs(folder: Path) -> Iterator[Path]:
-    """List the logs of a folder, topics of a bag or episodes of a dataset, ordered by name.
+    """Yield the logs of a folder, topics of a bag or episodes of a dataset, ordered by name.
 
     Args:
         folder: Folder of files, ROS bag, or LeRobot dataset.

@@ -64,6 +64,7 @@ def read_messages(path: Path, topic: str) -> Iterator[tuple[Any, int]]:
         InputError: A message cannot be decoded.
     """
     names = [name for name in _list_topics(path) if name.lstrip("/") == topic]
+    # A channel is the part of a topic with one encoding and one schema of messages.
     decoders: dict[int, Callable[[bytes], Any]] = {}
     with _open_file(path) as reader:
         for schema, channel, message in reader.iter_messages(topics=names):
@@ -99,10 +100,12 @@ def _make_decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], A
 
 
 def _list_topics(path: Path) -> set[str]:
-    """Return the topics with messages in JSON or Protobuf.
+    """Return the names of the topics with messages in JSON or Protobuf.
+
+    They are in the summary at the end of the file. Without one, all messages are read.
 
     Args:
-        path: MCAP file. Without a summary at its end, all messages are read.
+        path: MCAP file.
     """
     with _open_file(path) as reader:
         summary = reader.get_summary()
@@ -142,24 +145,26 @@ class MessageTable:
     """Table to which the messages of a topic are added one by one."""
 
     def __init__(self, wanted_names: Collection[str] = ()) -> None:
-        """Start with no messages; the wanted names are compared in lower case.
+        """Start with no messages.
 
-        `_stamps` and `_written` hold the times of the messages in seconds: from their
-        headers, and when they were written to the log.
+        `_stamps` and `_written` hold the times of the messages in seconds: from their headers (0 if
+        they have none), and when they were written to the log. `_numbers` has all other columns.
 
         Args:
             wanted_names: Names of the numbers to store, in any case; all if empty.
         """
-        # A column named run may number the runs of the log.
-        self._wanted = (
-            {name.strip().lower() for name in (*wanted_names, "run")} if wanted_names else set()
-        )
+        self._wanted = {name.strip().lower() for name in wanted_names}
+        if self._wanted:
+            # A column named run may number the runs of the log.
+            self._wanted.add("run")
         self._stamps = array("d")
         self._written = array("d")
         self._numbers: dict[str, array[float]] = {}
 
     def add(self, message: Any, written: int) -> None:
-        """Append the numbers of one message; numbers missing from it become NaN.
+        """Append a row with the numbers of one message.
+
+        A column that begins with this message has NaN in all rows before.
 
         Args:
             message: Decoded message.
@@ -172,20 +177,21 @@ class MessageTable:
             if self._wanted and name.lower() not in self._wanted:
                 continue
             column = self._numbers.setdefault(name, array("d"))
+            # Earlier messages may have lacked this number.
             column.extend([np.nan] * (row - len(column)))
             # A list of named objects may contain a name twice; its first number counts.
             if len(column) == row:
                 column.append(value)
 
     def columns(self) -> dict[str, Array]:
-        """Return all columns (T,) by name, ordered by time stamp.
+        """Return all columns (T,) by name, ordered by time stamp, and empty the table.
 
-        A number that a message lacks is NaN. The table is empty afterwards, since columns
-        are released.
+        A number that a message lacks is NaN. The time stamps are those of the message headers, or
+        if some message has none, the times of writing.
         """
         message_count = len(self._stamps)
         stamps = np.array(self._stamps)
-        # Header stamps of zero were not filled in: use the times of writing instead.
+        # Header stamps of zero were not filled in.
         times = stamps if message_count and (stamps > 0).all() else np.array(self._written)
         order = None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
         result = {TIME_COLUMN: make_read_only(times if order is None else times[order])}
@@ -201,8 +207,8 @@ class MessageTable:
 def _get_fields(value: Any) -> dict[str, Any] | None:
     """Return the fields of a message by name; None if the value is not a message.
 
-    Messages of ROS are dataclasses, JSON messages are mappings, and Protobuf messages have a
-    descriptor.
+    A message of ROS is a dataclass, a JSON message a mapping, and a Protobuf message has a
+    descriptor of its fields.
 
     Args:
         value: Message or part of a message.
@@ -227,24 +233,23 @@ def _get_fields(value: Any) -> dict[str, Any] | None:
 def _get_stamp(message: Any) -> float:
     """Return the time stamp of a message in seconds; 0 if it has none.
 
-    The stamp is in the header of a ROS message, else in one of the fields `STAMP_FIELDS`.
+    The stamp is in the header of a ROS message, else in the message itself, in one of the fields
+    `STAMP_FIELDS`. It has a whole number of seconds, and perhaps one of nanoseconds.
 
     Args:
         message: Message of any encoding.
     """
     fields = _get_fields(message) or {}
-    for table in (_get_fields(fields.get("header")) or {}, fields):
+    header = _get_fields(fields.get("header")) or {}
+    for table in (header, fields):
         for name in STAMP_FIELDS:
             parts = _get_fields(table.get(name)) or {}
             seconds = [parts[key] for key in SECONDS_FIELDS if key in parts]
             nanoseconds = [parts[key] for key in NANOSECONDS_FIELDS if key in parts]
-            if seconds and all(
-                isinstance(part, int | np.integer) for part in (*seconds, *nanoseconds)
-            ):
+            if seconds and all(isinstance(n, int | np.integer) for n in (*seconds, *nanoseconds)):
                 # Whole nanoseconds, so that equal stamps of two topics become equal numbers.
-                return _SECONDS_PER_NANOSECOND * _to_float(
-                    NANOSECONDS * int(seconds[0]) + sum(map(int, nanoseconds[:1]))
-                )
+                total = NANOSECONDS * int(seconds[0]) + int(nanoseconds[0] if nanoseconds else 0)
+                return _SECONDS_PER_NANOSECOND * _to_float(total)
     return 0.0
 
 
@@ -257,10 +262,16 @@ def _to_float(number: Any) -> float:
 
 
 def _iterate_numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
-    """Iterate over the numbers of a message with their names.
+    """Iterate over the numbers in a value of a message with their names.
 
-    `path` is the name of the value so far, and `depth` the number of messages around it. Texts
-    and long lists, such as images, are left out.
+    A number in a nested message is named ``pose.x``, and one in a list ``velocity[2]``, or by the
+    name of the entry if it has one: ``joints.elbow.position``. Texts, long lists such as images,
+    and messages nested deeper than `MAX_MESSAGE_DEPTH` are left out.
+
+    Args:
+        path: name of the value, empty for a whole message.
+        value: number, list, message, or anything else.
+        depth: number of lists and messages around it.
     """
     if isinstance(value, bool | int | float | np.number | np.bool_):
         yield path, _to_float(value)
@@ -285,7 +296,12 @@ def _iterate_message_numbers(
     """Yield the numbers of a message with their names, except its time stamp.
 
     A field with one number for each of the message's names, such as the joints of a JointState,
-    is named by them: ``position.elbow``. `depth` counts the levels of nested messages.
+    is named by them: ``position.elbow``.
+
+    Args:
+        path: name of the message, empty for the outermost one.
+        message: its fields by name.
+        depth: number of lists and messages around it.
     """
     names = message.get("name") or message.get("names") or message.get("joint_names") or ()
     for field, value in message.items():
@@ -301,11 +317,11 @@ def _iterate_message_numbers(
 
 
 def _is_named(values: Any, names: Any) -> bool:
-    """Return whether a list has a name for each of its numbers.
+    """Return whether a list of numbers has a name for each of them.
 
     Args:
-        values: list or array of numbers in a message.
-        names: list of texts in the same message.
+        values: field of a message, of any type.
+        names: field of the same message that may hold names.
     """
     if isinstance(names, str) or not _is_list(names) or not all(isinstance(n, str) for n in names):
         return False
@@ -333,17 +349,18 @@ def is_bag(path: Path) -> bool:
 
 
 def split_bag_path(path: Path) -> tuple[Path, str] | None:
-    """Split a path into a bag and a topic inside it; None if the path is not inside a bag."""
-    for parent in path.parents:
-        if parent.exists():
-            if not is_bag(parent):
-                return None
-            return parent, "/" + path.relative_to(parent).as_posix()
-    return None
+    """Split a path into a bag and a topic inside it; None if the path is not inside a bag.
+
+    The topic has a leading slash.
+    """
+    container = next((parent for parent in path.parents if parent.exists()), None)
+    if container is None or not is_bag(container):
+        return None
+    return container, "/" + path.relative_to(container).as_posix()
 
 
 def list_topics(bag: Path) -> list[str]:
-    """List the topics of a bag, without their leading slash.
+    """List the topics of a bag in alphabetical order, without their leading slash.
 
     Raises:
         InputError: The bag cannot be read, or rosbags is not installed.
@@ -370,6 +387,7 @@ def read_topic(bag: Path, topic: str, wanted_names: Collection[str] = ()) -> dic
         InputError: The bag has no such topic, or its messages cannot be read.
     """
     table = MessageTable(wanted_names)
+    # An MCAP file with messages in JSON or Protobuf.
     topics = list_mcap_topics(bag)
     if topics:
         # Topics of other loggers need not begin with a slash.
@@ -378,6 +396,7 @@ def read_topic(bag: Path, topic: str, wanted_names: Collection[str] = ()) -> dic
         for message, stamp in read_messages(bag, topic.lstrip("/")):
             table.add(message, stamp)
         return table.columns()
+    # Any other bag, with messages of ROS.
     with _open_bag(bag) as reader:
         connections = [c for c in reader.connections if c.topic == topic]
         if not connections:

@@ -76,61 +76,64 @@ def find_layout(path: Path) -> Layout:
     """Find the layout of a table from its first lines.
 
     The separator is detected first, then the first row of numbers. The header is the last row above
-    it that can be names; a row of units may lie in between. Without a header, columns are numbered.
+    it that can be names; a row of units may lie in between. Without a header, the layout has no
+    names, except if the first row is 0, 1, 2, ... as pandas writes it.
+
+    Args:
+        path: Path of the table.
 
     Raises:
         InputError: The table has no rows, or its header has another number of cells than its rows.
     """
     encoding, lines = _read_first_lines(path)
-    data_lines = [line for line in lines if line.strip() and not COMMENT.match(line)]
-    separator = _detect_separator(data_lines)
-    rows = {
-        n: _split_line(line, separator) for n, line in enumerate(lines, start=1) if line.strip()
-    }
-    width = _find_row_width([row for n, row in rows.items() if not COMMENT.match(lines[n - 1])])
+    # Lines are numbered from 1; 0 stands for no line. Blank lines are left out.
+    text_by_line = {n: text for n, text in enumerate(lines, start=1) if text.strip()}
+    comment_lines = {n for n, text in text_by_line.items() if COMMENT.match(text)}
+    separator = _detect_separator(
+        [text for n, text in text_by_line.items() if n not in comment_lines]
+    )
+    rows = {n: _split_line(text, separator) for n, text in text_by_line.items()}
+    width = _find_row_width([row for n, row in rows.items() if n not in comment_lines])
     columns = _find_numeric_columns(rows.values(), width)
     first_data_line = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
-    # Lines are numbered from 1; 0 stands for no line.
-    rows_above = [n for n in rows if n < first_data_line] if first_data_line else list(rows)
+    lines_above = [n for n in rows if n < first_data_line] if first_data_line else list(rows)
     units_by_column: dict[int, str] = {}
-    if rows_above and first_data_line:
+    if lines_above and first_data_line:
         # Missing cells at the end of the row are empty.
-        units_by_column = _parse_units([*rows[rows_above[-1]], *[""] * width], columns)
+        units_by_column = _parse_units([*rows[lines_above[-1]], *[""] * width], columns)
     if units_by_column:
-        rows_above.pop()
-    for n in reversed(rows_above):
-        names = _parse_header(lines[n - 1], separator, width, columns)
+        lines_above.pop()
+    for n in reversed(lines_above):
+        names = _parse_header(text_by_line[n], separator, width, columns)
         if names is not None:
             units = {names[column]: unit for column, unit in units_by_column.items()}
-            return Layout(
-                path, encoding, separator, names, units, n, first_data_line or n + 1, width
-            )
+            # A table may end with its header.
+            first = first_data_line or n + 1
+            return Layout(path, encoding, separator, names, units, n, first, width)
     if not first_data_line:
         first_line = format_value(lines[0].strip())
         raise InputError(f"{path}: expected a header and rows of numbers, found {first_line}")
-    rows_above = [n for n in rows_above if not COMMENT.match(lines[n - 1])]
-    if not rows_above and (column_numbers := _make_column_numbers(rows, first_data_line)):
-        return Layout(
-            path,
-            encoding,
-            separator,
-            column_numbers,
-            {},
-            first_data_line,
-            first_data_line + 1,
-            width,
-        )
-    if rows_above and len(rows[rows_above[-1]]) > 1 and width > 1:
-        n = rows_above[-1]
+    lines_above = [n for n in lines_above if n not in comment_lines]
+    if not lines_above:
+        # The row of numbers itself may be the header; otherwise there are no names.
+        column_numbers = _make_column_numbers(rows, first_data_line)
+        header = first_data_line if column_numbers else 0
+        first = first_data_line + 1 if column_numbers else first_data_line
+        return Layout(path, encoding, separator, column_numbers, {}, header, first, width)
+    n = lines_above[-1]
+    if len(rows[n]) > 1 and width > 1:
         raise InputError(
             f"{path}, row {n}: expected {width} names, one for each cell of row "
             f"{first_data_line}, found {len(rows[n])}; give each column a name"
         )
+    # The line above is a note.
     return Layout(path, encoding, separator, (), {}, 0, first_data_line, width)
 
 
 def _read_first_lines(path: Path) -> tuple[str, list[str]]:
-    """Return the encoding of a file and its first complete lines, at most `_HEAD_LINES`.
+    """Return the encoding of a file and its first complete lines.
+
+    At most `_HEAD_BYTES` bytes and `_HEAD_LINES` lines are read.
 
     Raises:
         InputError: the file is empty, or holds binary data.
@@ -141,7 +144,7 @@ def _read_first_lines(path: Path) -> tuple[str, list[str]]:
     encoding = _detect_encoding(path, first_bytes)
     lines = first_bytes.decode(encoding, errors="replace").splitlines()
     if not is_complete and len(lines) > 1:
-        lines.pop()  # the last line is incomplete
+        lines.pop()  # the last line may be cut
     lines = lines[:_HEAD_LINES]
     if not any(line.strip() for line in lines):
         raise InputError(f"{path}: expected a table with a header and rows, found an empty file")
@@ -188,11 +191,12 @@ def _split_line(line: str, separator: str) -> list[str]:
 def _detect_separator(lines: Sequence[str]) -> str:
     """Return the separator with which the largest share of the cells are numbers.
 
-    Rows with the usual number of cells count; of equal shares, the separator with more columns
-    wins.
+    Only rows with the most frequent number of cells count: the share of numbers among their cells
+    is multiplied by their share of all rows. Of equal shares, the separator with more columns wins.
+    It is a comma if no separator gives several columns.
 
     Args:
-        lines: First lines of the file.
+        lines: First lines of the file, without comments and blank lines.
     """
     best, best_score = ",", (-1.0, 0.0)
     for separator in SEPARATORS:
@@ -201,17 +205,20 @@ def _detect_separator(lines: Sequence[str]) -> str:
         if width < 2:
             continue
         full_rows = [row for row in rows if len(row) == width]
-        numeric = np.mean(
-            [is_numeric(cell) for row in full_rows for cell in row if cell.strip()] or 0
-        )
-        score = (round(float(numeric) * len(full_rows) / len(rows), 6), float(width))
+        cells = [cell for row in full_rows for cell in row if cell.strip()]
+        numeric_share = float(np.mean([is_numeric(cell) for cell in cells] or 0))
+        # Rounded, so that equal shares are equal numbers.
+        score = (round(numeric_share * len(full_rows) / len(rows), 6), float(width))
         if score > best_score:
             best, best_score = separator, score
     return best
 
 
 def _find_row_width(rows: Sequence[Sequence[str]]) -> int:
-    """Return the most frequent number of cells per row, including empty ones at the end."""
+    """Return the most frequent number of cells per row, including empty ones at the end.
+
+    Of equally frequent numbers, it is the largest.
+    """
     counts = Counter(len(row) for row in rows)
     return max(counts, key=lambda count: (counts[count], count), default=0)
 
@@ -225,17 +232,20 @@ def _find_numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int
     """
     full_rows = [row for row in rows if len(row) == width]
     # The second half of the inspected rows is data, whatever precedes it.
-    body = full_rows[len(full_rows) // 2 :]
-    result = []
+    data_rows = full_rows[len(full_rows) // 2 :]
+    numeric_columns = []
     for column in range(width):
-        filled = [row[column] for row in body if row[column].strip()]
-        if filled and 2 * sum(map(is_numeric, filled)) >= len(filled):
-            result.append(column)
-    return result
+        filled_cells = [row[column] for row in data_rows if row[column].strip()]
+        if filled_cells and 2 * sum(map(is_numeric, filled_cells)) >= len(filled_cells):
+            numeric_columns.append(column)
+    return numeric_columns
 
 
 def _is_data(row: Sequence[str], width: int, columns: Sequence[int]) -> bool:
     """Return whether a row contains numbers rather than names, notes or units.
+
+    Of the cells in columns of numbers, some must be numbers, and either none a text or the first a
+    number: a row of data may have a text where a reading failed.
 
     Args:
         row: cells of the row.
@@ -244,10 +254,10 @@ def _is_data(row: Sequence[str], width: int, columns: Sequence[int]) -> bool:
     """
     if len(row) != width:
         return False
-    cells = [row[place].strip() for place in columns]
-    numbers = [is_numeric(cell) for cell in cells]
-    texts = [bool(cell) and not number for cell, number in zip(cells, numbers, strict=True)]
-    return any(numbers) and (not any(texts) or numbers[0])
+    cells = [row[column].strip() for column in columns]
+    are_numbers = [is_numeric(cell) for cell in cells]
+    has_text = any(cell and not is_numeric(cell) for cell in cells)
+    return any(are_numbers) and (not has_text or are_numbers[0])
 
 
 def _parse_header(
@@ -255,11 +265,15 @@ def _parse_header(
 ) -> tuple[str, ...] | None:
     """Return the column names in a line; None if the line is not a header.
 
+    A header may be a comment. It has a name for each cell of a row; at most one column of numbers
+    may lack a name. Names may be numbers, except that of the first column of numbers, if they are
+    different whole numbers.
+
     Args:
         line: line before the first row of numbers.
         separator: separator of the rows.
         width: number of cells in a row.
-        columns: positions of the columns with numbers, which must have names.
+        columns: positions of the columns with numbers.
     """
     comment = COMMENT.match(line)
     # `%time,field.data` of rostopic begins with a name, `% t q1` of Matlab with a comment.
@@ -278,45 +292,45 @@ def _parse_header(
     if len(names) != width:
         return None
     stripped_names = [name.strip(", ;\t" if separator == " " else None) for name in names]
-    missing = sum(not stripped_names[place] for place in columns)
-    numeric_names = [
-        stripped_names[place] for place in columns if is_numeric(stripped_names[place])
-    ]
-    if missing > 1 or (columns and is_numeric(stripped_names[columns[0]])):
+    required_names = [stripped_names[column] for column in columns]
+    if required_names.count("") > 1 or (required_names and is_numeric(required_names[0])):
         return None
     # Joints may be numbered, `time,1,2,3`, but a note with a number is not a header, `Rate;100`.
-    if not all(number.isdigit() for number in numeric_names) or len(set(numeric_names)) < len(
-        numeric_names
-    ):
+    numeric_names = [name for name in required_names if is_numeric(name)]
+    is_numbered = all(map(str.isdigit, numeric_names))
+    if not is_numbered or len(set(numeric_names)) < len(numeric_names):
         return None
     return tuple(stripped_names)
 
 
 def _parse_units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
-    """Return the units by position if a row contains units only; otherwise nothing.
+    """Return the units by column if a row contains units only; otherwise an empty dictionary.
 
     Args:
-        row: cells of the row below the header.
+        row: cells of the row below the header; some may be empty.
         columns: positions of the columns that hold numbers.
     """
-    units_by_place = {}
+    units_by_column = {}
     for column in columns:
         text = row[column].strip().strip("[](){}<> ")
         if not text:
             continue
-        unit = read_unit(text)
-        if unit is None or is_numeric(row[column]):
+        unit_and_quantity = read_unit(text)
+        if unit_and_quantity is None or is_numeric(row[column]):
             return {}
-        units_by_place[column] = unit[0]
-    return units_by_place
+        units_by_column[column], _ = unit_and_quantity
+    return units_by_column
 
 
 def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple[str, ...]:
-    """Return the column numbers that pandas writes for unnamed columns; otherwise nothing.
+    """Return the cells of the first row if they are column numbers, as pandas writes for no names.
+
+    The numbers count from 0 or 1; the first cell is empty if pandas has written its index. The
+    result is empty if the first row is anything else.
 
     Args:
         rows: cells of the first lines, by the number of the line.
-        first: line of the first row with cells.
+        first: number of the first row.
     """
     cells = tuple(cell.strip() for cell in rows[first])
     numbers = cells[1:] if cells and not cells[0] else cells
@@ -325,8 +339,8 @@ def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple
         return ()
     # A first row 0, 1, 2, ... may also be data, unless the following rows contain fractions.
     following_rows = [row for line, row in rows.items() if line > first]
-    fractions = any("." in cell or "," in cell for row in following_rows for cell in row)
-    return cells if fractions else ()
+    has_fractions = any("." in cell or "," in cell for row in following_rows for cell in row)
+    return cells if has_fractions else ()
 
 
 def is_numeric(cell: str) -> bool:
@@ -351,7 +365,11 @@ BOOLEAN_VALUES = {"true": 1.0, "false": 0.0}
 def read_text_table(path: Path) -> LogFile:
     """Read a text table of any layout as a log.
 
-    The layout (separator, header, row of units) is found automatically.
+    The layout (separator, header, row of units) is found automatically. Columns without names of
+    joints get those of other columns that hold such names.
+
+    Args:
+        path: Path of the table.
 
     Raises:
         InputError: The file is not a table, or a cell does not fit its column; the one-line message
@@ -361,26 +379,26 @@ def read_text_table(path: Path) -> LogFile:
     named_cells = zip(_make_unique_names(layout), _read_cells(layout), strict=True)
     text_columns = [_TextColumn(layout, name, cells) for name, cells in named_cells]
     # One column may resolve an ambiguity of another: `1,234` is 1.234 in a file that has `0,5`.
-    commas = any(column.has_decimal_commas for column in text_columns)
+    has_decimal_commas = any(column.has_decimal_commas for column in text_columns)
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
     for column in text_columns:
-        values = column.convert_to_numbers(commas)
+        values = column.convert_to_numbers(has_decimal_commas)
         if values is None:
             texts[column.name] = column.texts.tolist()
         else:
             columns[column.name] = make_read_only(values)
-    named_columns, unlisted = name_numbered_columns(columns, texts)
-    list_columns, replaced = name_list_entries(columns, texts)
+    named_columns, replaced_columns = name_numbered_columns(columns, texts)
+    named_entries, replaced_lists = name_list_entries(columns, texts)
     return LogFile(
         path,
-        {**columns, **named_columns, **list_columns},
+        {**columns, **named_columns, **named_entries},
         tuple(texts),
-        "row",
-        layout.units,
-        unlisted | replaced,
-        bool(layout.names),
-        layout.first,
+        rows="row",
+        units=layout.units,
+        unlisted=replaced_columns | replaced_lists,
+        named=bool(layout.names),
+        first=layout.first,
     )
 
 
@@ -388,29 +406,30 @@ def _make_unique_names(layout: Layout) -> list[str]:
     """Make the column names unique as pandas does: ``q``, ``q.1``, ``Unnamed: 3``.
 
     Args:
-        layout: Layout of the table; it has no names if the file has no header.
+        layout: Layout of the table. Without names, columns are called ``column 1`` and so on.
     """
-    names = layout.names or tuple(
-        f"column {column_index + 1}" for column_index in range(layout.width)
-    )
-    result: list[str] = []
-    for column_index, name in enumerate(names):
-        unique_name = name or f"Unnamed: {column_index}"
-        number = 1
-        while unique_name in result:
-            unique_name, number = f"{name}.{number}", number + 1
-        result.append(unique_name)
-    return result
+    names = layout.names or [f"column {column + 1}" for column in range(layout.width)]
+    unique_names: list[str] = []
+    for column, name in enumerate(names):
+        unique_name = name or f"Unnamed: {column}"
+        repetition = 1
+        while unique_name in unique_names:
+            unique_name, repetition = f"{name}.{repetition}", repetition + 1
+        unique_names.append(unique_name)
+    return unique_names
 
 
 def _read_cells(layout: Layout) -> list[Any]:
     """Read the cells of each column as text, without comments and lines before the first row.
 
-    The file is read in the detected encoding, or as Windows-1252. Columns that are empty throughout
-    at the end are dropped.
+    The file is read in the detected encoding, or as Windows-1252. Columns at the end that have no
+    name and are empty throughout are dropped.
 
     Args:
         layout: layout of the table.
+
+    Returns:
+        For each column an array (T,) of texts, empty where a cell is missing.
 
     Raises:
         InputError: rows have different numbers of cells, or the text cannot be decoded.
@@ -421,7 +440,8 @@ def _read_cells(layout: Layout) -> list[Any]:
     for encoding in (layout.encoding, "cp1252"):
         try:
             with layout.path.open(encoding=encoding, newline="") as file:
-                # A quotation mark in a note above the header must not swallow the rows.
+                # Skipped here: a quotation mark in a note above the header would make pandas take
+                # the rows for one cell.
                 for _ in range(layout.first - 1):
                     next(file, "")
                 table = pandas.read_csv(
@@ -441,12 +461,13 @@ def _read_cells(layout: Layout) -> list[Any]:
             raise _find_uneven_row(layout) or _make_split_error(layout, error) from None
     else:
         raise InputError(f"{layout.path}: expected UTF-8 text; save it as UTF-8")
-    comment = table[0].str.match(COMMENT.pattern)
-    if comment.any():
-        table = table[~comment.to_numpy(dtype=bool)]
-    # pandas fills up rows that are too short.
-    if (table[table.columns[-1]].fillna("") == "").any() and (fault := _find_uneven_row(layout)):
-        raise fault
+    is_comment = table[0].str.match(COMMENT.pattern)
+    if is_comment.any():
+        table = table[~is_comment.to_numpy(dtype=bool)]
+    # pandas fills up rows that are too short with empty cells.
+    has_empty_end = (table[table.columns[-1]].fillna("") == "").any()
+    if has_empty_end and (uneven_row := _find_uneven_row(layout)):
+        raise uneven_row
     while table.shape[1] > layout.width and (table[table.columns[-1]].fillna("") == "").all():
         table = table.iloc[:, :-1]
     if table.shape[1] > MAX_COLUMNS:
@@ -462,7 +483,7 @@ def _read_cells(layout: Layout) -> list[Any]:
 
 
 def _make_split_error(layout: Layout, error: Exception) -> InputError:
-    """Make the error for a file whose rows pandas cannot split.
+    """Make the error for a file whose rows pandas cannot split, although each has enough cells.
 
     Args:
         layout: layout of the table.
@@ -493,10 +514,10 @@ def _find_uneven_row(layout: Layout) -> InputError | None:
     line = layout.first
     try:
         for line, last_line, row in _iterate_rows(layout):
-            filled = len(row)
-            while filled > layout.width and not row[filled - 1].strip():
-                filled -= 1
-            if filled == layout.width:
+            count = len(row)
+            while count > layout.width and not row[count - 1].strip():
+                count -= 1
+            if count == layout.width:
                 continue
             if last_line > line:
                 return InputError(
@@ -504,13 +525,14 @@ def _find_uneven_row(layout: Layout) -> InputError | None:
                     f"{last_line}; close or delete it"
                 )
             reference = f"as in the header, row {layout.header}" if layout.header else "as above"
-            remedy = "correct or delete this row"
             is_last = all(later <= line for later, *_ in _iterate_rows(layout))
-            if filled < layout.width and is_last:
+            if count < layout.width and is_last:
                 remedy = "the log is truncated there: delete this row"
+            else:
+                remedy = "correct or delete this row"
             return InputError(
                 f"{layout.path}, row {line}: expected {layout.width} cells {reference}, "
-                f"found {filled}; {remedy}"
+                f"found {count}; {remedy}"
             )
     except csv.Error:  # such as a cell of more than 131,072 characters
         return InputError(
@@ -521,10 +543,14 @@ def _find_uneven_row(layout: Layout) -> InputError | None:
 
 
 def _iterate_rows(layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
-    """Iterate over the data rows with their first and last lines; skip comments and blank lines.
+    """Iterate over the rows of data; skip comments and blank lines.
 
     Args:
         layout: layout of the table.
+
+    Yields:
+        Number of the first and of the last line of a row, and its cells. They are different lines
+        if a quoted cell contains a line end.
     """
     with layout.path.open(encoding=layout.encoding, errors="replace", newline="") as file:
         if layout.separator == " ":
@@ -535,12 +561,12 @@ def _iterate_rows(layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
         for _ in range(layout.first - 1):
             next(file, "")
         reader = csv.reader(file, delimiter=layout.separator, skipinitialspace=True)
-        last_line = layout.first - 1
+        previous_line = layout.first - 1
         for row in reader:
-            last = layout.first - 1 + reader.line_num
+            last_line = layout.first - 1 + reader.line_num
             if any(row) and not COMMENT.match(row[0]):
-                yield last_line + 1, last, row
-            last_line = last
+                yield previous_line + 1, last_line, row
+            previous_line = last_line
 
 
 def _find_line(layout: Layout, record: int) -> int:
@@ -567,7 +593,9 @@ class _TextColumn:
         """Find out whether commas in a column are decimal commas or thousands separators.
 
         If most of the sampled cells with a comma are not numbers, the column holds lists or
-        text, and its commas have no meaning. `filled` are the cells that are not empty.
+        text, and its commas have no meaning (`has_commas` is False). Otherwise they are decimal
+        commas, thousands separators, or ambiguous if neither is set. `series` has the cells
+        without blanks around them, and `filled` those that are not empty.
 
         Args:
             layout: Layout of the table.
@@ -585,29 +613,30 @@ class _TextColumn:
         commas = self.filled[self.filled.str.contains(",", regex=False)]
         sampled_cells = commas.iloc[:: max(len(commas) // MAX_SAMPLED_CELLS, 1)]
         # Lists and texts may contain commas, too.
-        if commas.empty or 2 * sum(map(bool, map(NUMBER.fullmatch, sampled_cells))) < len(
-            sampled_cells
-        ):
+        number_count = sum(map(bool, map(NUMBER.fullmatch, sampled_cells)))
+        if commas.empty or 2 * number_count < len(sampled_cells):
             return
         self.has_commas = True
-        has_several_commas = (commas.str.count(",") > 1) | commas.str.contains(r",.*\.", regex=True)
-        self.is_thousands = bool(has_several_commas.any())
+        # Several commas in a cell, or a point after a comma, as in 1,234,567 and 1,234.5.
+        is_grouped = (commas.str.count(",") > 1) | commas.str.contains(r",.*\.", regex=True)
+        self.is_thousands = bool(is_grouped.any())
         if self.layout.separator != ",":
             self.has_decimal_commas = not self.is_thousands
         else:
-            # Three digits after a comma may be a group of thousands, unless other cells show
-            # decimals.
-            groups = commas.str.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")
-            self.has_decimal_commas = not bool(groups.all()) and not self.is_thousands
+            # Where commas also separate cells, 1,234 may be a group of thousands, unless other
+            # cells show decimals.
+            may_be_groups = commas.str.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")
+            self.has_decimal_commas = not bool(may_be_groups.all()) and not self.is_thousands
 
-    def convert_to_numbers(self, commas: bool) -> Array | None:
+    def convert_to_numbers(self, file_has_decimal_commas: bool) -> Array | None:
         """Convert the cells to numbers.
 
-        The first cell decides the kind: Boolean values, lists, dates or numbers. If more than half
-        of the cells are no numbers, the column counts as text.
+        The first cell that is not empty decides the kind: Boolean values, lists, dates or numbers.
+        Empty cells, and marks such as "nan", are missing numbers (NaN). If more than half of the
+        cells are not numbers, the column counts as text.
 
         Args:
-            commas: Whether another column of the file has decimal commas.
+            file_has_decimal_commas: Whether some column of the file has decimal commas.
 
         Returns:
             Numbers (T,) or (T, k); None if the column holds text.
@@ -630,7 +659,7 @@ class _TextColumn:
             return self._convert_dates()
         texts = self.series
         if self.has_commas:
-            if self.has_decimal_commas or (commas and not self.is_thousands):
+            if self.has_decimal_commas or (file_has_decimal_commas and not self.is_thousands):
                 texts = self._convert_decimal_commas()
             elif self.is_thousands:
                 texts = texts.str.replace(",", "", regex=False)
@@ -641,8 +670,8 @@ class _TextColumn:
                 )  # fmt: skip
         values = pandas.to_numeric(texts.where(texts != "", "nan"), errors="coerce")
         result = np.asarray(values, dtype=np.float64)
-        is_no_number = (texts == "") | texts.str.lower().isin(NO_NUMBER)
-        bad_rows = np.flatnonzero(np.isnan(result) & ~is_no_number.to_numpy(dtype=bool))
+        is_missing = (texts == "") | texts.str.lower().isin(NO_NUMBER)
+        bad_rows = np.flatnonzero(np.isnan(result) & ~is_missing.to_numpy(dtype=bool))
         if bad_rows.size == 0:
             return result
         if bad_rows.size > 0.5 * len(self.filled):
@@ -652,29 +681,32 @@ class _TextColumn:
     def _convert_decimal_commas(self) -> Any:
         """Return the cells with decimal points instead of decimal commas.
 
-        Points before groups of three digits are removed if some cell has both marks.
+        Some cells may contain points, too:
+
+        * If a cell has a point before a comma, as in 1.234,5, points before three digits separate
+          thousands and are removed.
+        * Otherwise a cell with a point is an error: with a decimal comma, 1.234 is more than a
+          thousand; with a decimal point, it is about one.
 
         Raises:
             InputError: points without commas leave the meaning of a cell open.
         """
-        grouped = self.filled.str.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?")
         if self.filled.str.contains(r"\..*,", regex=True).any():
             texts = self.series.str.replace(r"\.(?=\d{3}(\D|$))", "", regex=True)
-        else:
-            points = self.filled.str.contains(".", regex=False)
-            if points.any():
-                # With a decimal comma, 1.234 is more than a thousand; with a decimal point, it is
-                # about one.
-                row = int(points.index.to_numpy()[points.to_numpy().argmax()])
-                note = "; other cells of this column have decimal commas"
-                if not grouped[points].all():
-                    raise self._make_cell_error(row, "a decimal comma", note)
-                raise self._make_cell_error(row, "a number without a point", note)
-            texts = self.series
-        return texts.str.replace(",", ".", n=1, regex=False)
+            return texts.str.replace(",", ".", n=1, regex=False)
+        has_point = self.filled.str.contains(".", regex=False)
+        if not has_point.any():
+            return self.series.str.replace(",", ".", n=1, regex=False)
+        row = int(has_point.idxmax())  # the first one
+        is_grouped = self.filled[has_point].str.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?")
+        expected = "a number without a point" if is_grouped.all() else "a decimal comma"
+        note = "; other cells of this column have decimal commas"
+        raise self._make_cell_error(row, expected, note)
 
     def _convert_dates(self) -> Array | None:
         """Convert times such as ``2026-11-26 17:24:01.123`` to (T,) seconds since 1970.
+
+        Empty cells become NaN.
 
         Raises:
             InputError: a cell is not a time.
@@ -700,27 +732,22 @@ class _TextColumn:
             InputError: a cell is not a list, or has another length than the first one.
         """
         number_lists: list[list[float]] = []
-        for cell_index, text in enumerate(self.texts):
+        expected = "a list of numbers"
+        for row, text in enumerate(self.texts):
             number_list = _parse_number_list(text)
-            if (
-                number_list is None
-                or (number_lists and len(number_list) != len(number_lists[0]))
-                or len(number_list) > MAX_COLUMNS
-            ):
-                expected = (
-                    f"a list of {len(number_lists[0])} numbers"
-                    if number_lists
-                    else "a list of numbers"
-                )
-                raise self._make_cell_error(cell_index, expected)
+            if number_list is None or len(number_list) > MAX_COLUMNS:
+                raise self._make_cell_error(row, expected)
+            if row > 0 and len(number_list) != len(number_lists[0]):
+                raise self._make_cell_error(row, expected)
             number_lists.append(number_list)
+            expected = f"a list of {len(number_lists[0])} numbers"
         return np.array(number_lists, dtype=np.float64).reshape(len(number_lists), -1)
 
     def _make_cell_error(self, record: int, expected: str, note: str = "") -> InputError:
         """Make the error for a cell that does not fit its column.
 
         Args:
-            record: number of the data row, counted from 0.
+            record: number of the row of data, counted from 0.
             expected: expected content in words.
             note: addition at the end of the message.
         """

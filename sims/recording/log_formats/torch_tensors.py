@@ -124,22 +124,28 @@ def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
 def _read_tensors(
     path: Path, archive: zipfile.ZipFile
 ) -> tuple[dict[str, Array], dict[str, list[str]]]:
-    """Read all tensors of one or two dimensions in an archive, and its lists of texts, by name.
+    """Read all tensors of one or two dimensions in an archive, and its lists of texts.
 
     Args:
         path: path of the file, for messages.
         archive: archive, open for reading.
 
+    Returns:
+        Tensors by name, (T,) or (T, k), and the texts of each other entry, empty where it holds
+        something else.
+
     Raises:
         InputError: the archive has no single pickle program, or one that is too large.
     """
+    # The pickle program builds the containers of the tensors; their numbers are in other members.
     programs = [name for name in archive.namelist() if name.endswith("/data.pkl")]
     if len(programs) != 1:
         raise InputError(f"{path}: expected one data.pkl in the archive, found {len(programs)}")
-    if archive.getinfo(programs[0]).file_size > MAX_PROGRAM:
+    (program,) = programs
+    if archive.getinfo(program).file_size > MAX_PROGRAM:
         raise InputError(f"{path}: data.pkl is too large for a log of tensors")
-    folder = programs[0].removesuffix("data.pkl")
-    content = _TensorUnpickler(io.BytesIO(archive.read(programs[0]))).load()
+    folder = program.removesuffix("data.pkl")
+    content = _TensorUnpickler(io.BytesIO(archive.read(program))).load()
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
     for name, value in _flatten_containers("", content, 0):
@@ -153,15 +159,18 @@ def _read_tensors(
 
 
 def _flatten_containers(name: str, value: Any, depth: int) -> list[tuple[str, Any]]:
-    """Flatten nested containers to named entries; lists of numbers and texts stay whole.
+    """Flatten nested dictionaries and lists to named entries.
 
-    The name of an entry is its path, such as ``episode/0/action``. Containers nested deeper than
-    `MAX_DEPTH` stay whole, too.
+    The name of an entry is its path, such as ``episode/0/action``. Lists of numbers and texts stay
+    whole, and so do containers nested deeper than `MAX_DEPTH`.
 
     Args:
-        name: name of the container, the beginning of the names of its entries.
-        value: the container, or an entry.
+        name: name of the value, the beginning of the names of its entries; empty for the outermost.
+        value: a container, or an entry.
         depth: number of containers around it.
+
+    Returns:
+        Name and value of each entry.
 
     Raises:
         ValueError: There are more than `MAX_COLUMNS` entries, as where containers hold each other.
@@ -186,7 +195,8 @@ def _flatten_containers(name: str, value: Any, depth: int) -> list[tuple[str, An
 def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Tensor) -> Array:
     """Read the numbers of a tensor from its storage in the archive.
 
-    Element (i, j) is the number at offset + i stride_0 + j stride_1 of the storage.
+    Element (i, j) is the number at offset + i stride_0 + j stride_1 of the storage. The sizes in
+    the file are checked before memory is allocated for them.
 
     Args:
         path: path of the file, for messages.
@@ -211,9 +221,12 @@ def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Te
         stored_numbers = (stored_numbers.astype(np.uint32) << 16).view(np.float32)
     if 0 in tensor.size:
         return make_read_only(np.empty(tensor.size))
-    steps = [(n - 1) * s for n, s in zip(tensor.size, tensor.stride, strict=True)]
-    if min(tensor.offset, *tensor.stride) < 0 or tensor.offset + sum(steps) >= stored_numbers.size:
+    last_index = tensor.offset + sum(
+        (length - 1) * stride for length, stride in zip(tensor.size, tensor.stride, strict=True)
+    )
+    if min(tensor.offset, *tensor.stride) < 0 or last_index >= stored_numbers.size:
         raise InputError(f"{path}: {member_name} has fewer numbers than its tensor")
+    # Indices of all elements, in the shape of the tensor.
     indices = np.full((), tensor.offset)
     for length, stride in zip(tensor.size, tensor.stride, strict=True):
         indices = indices[..., None] + stride * np.arange(length)

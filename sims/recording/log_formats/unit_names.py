@@ -82,7 +82,10 @@ class NamedUnit(NamedTuple):
 
 
 def read_unit(text: str) -> tuple[str, Quantity] | None:
-    """Return the unit that a text spells and its quantity; None if it is not a known unit."""
+    """Return the unit that a text spells and its quantity; None if it is not a known unit.
+
+    Case and blanks around operators do not count, and other blanks mean products.
+    """
     normalised_text = re.sub(r"\s*([*/^·⋅])\s*", r"\1", text.strip().lower().replace("**", "^"))
     return _UNITS.get(normalised_text) or _UNITS.get(normalised_text.replace(" ", "*"))
 
@@ -90,11 +93,11 @@ def read_unit(text: str) -> tuple[str, Quantity] | None:
 def split_unit(name: str) -> NamedUnit:
     """Split the name of a column into the name proper and the unit that follows it.
 
-    A unit may be in brackets (`q [rad]`), after a joiner (`q_rad_s`) or in camel case
-    (`speedRadS`).
+    A unit may be in brackets (`q [rad]`), after punctuation or a blank (`q_rad_s`), or in camel
+    case (`speedRadPerSec`).
 
     Returns:
-        The name without its unit; the whole name without a unit if none is found.
+        The name without its unit, and the unit; the whole name without a unit if none is found.
     """
     bracket_match = _BRACKETED_UNIT_PATTERN.fullmatch(name)
     # The brackets of `q[1]` hold an index and no unit.
@@ -102,7 +105,7 @@ def split_unit(name: str) -> NamedUnit:
         unit = read_unit(bracket_match["unit"])
         if unit is not None:
             return NamedUnit(bracket_match["name"], *unit)
-    # `q_rad_s` is in rad/s: use the longest unit at the end of the name.
+    # `q_rad_s` is in rad/s and not in s: use the longest unit at the end of the name.
     for position in range(1, len(name)):
         if name[position] not in _JOINERS:
             continue
@@ -112,7 +115,7 @@ def split_unit(name: str) -> NamedUnit:
             return NamedUnit(name[:position], *unit)
     camel_match = _CAMEL_CASE_UNIT_PATTERN.fullmatch(name)
     if camel_match:
-        unit = read_unit(camel_match["unit"]) or read_unit("rad/s")
-        assert unit is not None
+        # Of the units of the pattern, only RadPerSec is not spelled like a unit.
+        unit = read_unit(camel_match["unit"]) or ("rad/s", "angular velocity")
         return NamedUnit(camel_match["name"], *unit)
     return NamedUnit(name)
