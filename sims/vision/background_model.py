@@ -22,7 +22,7 @@ _LARGEST_OF_THREE_RATIO = 1.5
 
 
 def select_frames(moved: Array) -> list[int]:
-    """Select frames at even intervals of accumulated motion.
+    """Select the frames whose median is the background: at even intervals of accumulated motion.
 
     Frames at even intervals of time would mostly show a ball that comes to rest, which would then
     be part of the median.
@@ -31,14 +31,14 @@ def select_frames(moved: Array) -> list[int]:
         moved: (n,) mean change from the previous frame, grey levels.
 
     Returns:
-        Sorted numbers of the frames.
+        Sorted numbers of at most `MAX_BACKGROUND_FRAMES` frames.
     """
     count = len(moved)
-    # A small value for each frame, so that a film without motion has marks, too.
+    # Each frame counts a little, so that frames are also selected from a film without motion.
     min_motion = 1e-3 * moved.sum() / max(1, count)
-    path_length = np.cumsum(moved + min_motion + 1e-12)
-    targets = np.linspace(path_length[0], path_length[-1], min(MAX_BACKGROUND_FRAMES, count))
-    frame_numbers = np.searchsorted(path_length, targets - 1e-12).clip(0, count - 1)
+    accumulated = np.cumsum(moved + min_motion + 1e-12)
+    targets = np.linspace(accumulated[0], accumulated[-1], min(MAX_BACKGROUND_FRAMES, count))
+    frame_numbers = np.searchsorted(accumulated, targets - 1e-12).clip(0, count - 1)
     return sorted(set(frame_numbers.tolist()))
 
 
@@ -58,12 +58,13 @@ def compute_masked_background(
     previous: RgbImage,
     shaded: NDArray[np.bool_] | None = None,
 ) -> RgbImage:
-    """Return the median of pictures without the objects that hide the background.
+    """Return the pixelwise median of pictures without the objects that hide the background.
 
     Args:
         pictures: Pictures (height, width, 3), n of them.
         balls: Circles (u, v, radius) of the objects in each picture, pixels.
-        previous: Previous estimate of the background, used where no picture shows it.
+        previous: Previous estimate of the background, the median of all pictures. It is kept where
+            the background is never hidden, or hidden in all pictures.
         shaded: Mask (n, height, width) of shadows that also hide it; None for none.
     """
     height, width = previous.shape[:2]
@@ -74,13 +75,13 @@ def compute_masked_background(
         for u, v, radius in circles:
             distances = np.hypot(columns - u, rows - v)
             mask |= distances < _HIDDEN_RADII * radius + _HIDDEN_MARGIN_PIXELS
-    # Elsewhere the median is kept: pixels that are never hidden, or hidden in all pictures.
     is_partly_hidden = hidden.any(axis=0) & ~hidden.all(axis=0)
+    # (n, pixels, 3)
     colours = np.stack(pictures)[:, is_partly_hidden].astype(np.float32)
-    values = np.where(hidden[:, is_partly_hidden, None], np.nan, colours)
+    visible_colours = np.where(hidden[:, is_partly_hidden, None], np.nan, colours)
     result = previous.copy()
     if is_partly_hidden.any():
-        median = compute_nan_median(values)
+        median = compute_nan_median(visible_colours)
         # Add half a grey level, because the conversion to integers truncates.
         result[is_partly_hidden] = (median + 0.5).astype(np.uint8)
     return result
@@ -89,6 +90,8 @@ def compute_masked_background(
 def estimate_camera_noise(pictures: list[RgbImage], background: RgbImage) -> float:
     """Estimate the camera noise from pictures in which little differs from the background.
 
+    It is the median difference from the background, which most pixels show, over all pixels.
+
     Args:
         pictures: Pictures (height, width, 3).
         background: Background (height, width, 3).
@@ -96,24 +99,24 @@ def estimate_camera_noise(pictures: list[RgbImage], background: RgbImage) -> flo
     Returns:
         Standard deviation in grey levels of the worst colour.
     """
-    # A few pictures suffice, because each has many pixels.
+    # About eight pictures suffice, because each has many pixels.
     stride = max(1, len(pictures) // 8)
     largest_differences = [
         _compute_largest_difference(picture, background) for picture in pictures[::stride]
     ]
-    return float(
-        _SIGMA_PER_MEDIAN * np.median(np.stack(largest_differences)) / _LARGEST_OF_THREE_RATIO
-    )
+    median = np.median(np.stack(largest_differences))
+    # The largest of three colours differs more than a single one.
+    return float(_SIGMA_PER_MEDIAN * median / _LARGEST_OF_THREE_RATIO)
 
 
 def _compute_largest_difference(picture: RgbImage, background: RgbImage) -> NDArray[np.int16]:
-    """Return the largest difference over the colours (height, width).
+    """Return for each pixel the largest absolute difference of the three colours, (height, width).
 
     Args:
-        picture: picture with the ball.
-        background: picture without it.
+        picture: picture with the ball, (height, width, 3).
+        background: picture without it, (height, width, 3).
     """
-    # Unsigned integers would wrap around.
+    # Differences of unsigned integers would wrap around.
     signed = picture.astype(np.int16)
     differences = np.abs(signed - background)
     result: NDArray[np.int16] = differences.max(axis=2)

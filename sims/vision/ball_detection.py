@@ -116,9 +116,13 @@ class BallDetection(NamedTuple):
         """Return the detection with its centre refitted for a radius known from other pictures.
 
         If shade hides a part of the edge, a fit with free radius shifts both centre and radius.
+        Here only the centre (u, v) is fitted to the edge points: with their distance d from the
+        centre and the unit vector n towards them, Gauss-Newton steps solve
+        d - radius = n . (du, dv) by weighted least squares. The detection is returned unchanged if
+        there are too few edge points, or the fit moves to the edge of another object.
 
-        With a known radius, only the centre (u, v) is changed by Gauss-Newton steps of the circle
-        fit.
+        Args:
+            radius: Known radius, pixels.
         """
         if len(self.edges) < _MIN_REFIT_RAY_SHARE * _RAY_COUNT:
             return self
@@ -130,21 +134,19 @@ class BallDetection(NamedTuple):
             residual = distances - radius
             # Geman-McClure weights: points off the circle hardly count.
             weights = 1 / (1 + (residual / _TUKEY_WIDTH_KNOWN_RADIUS) ** 2) ** 2
-            # Equation (2) of sims.vision.circle_fit without dR
             rows = np.stack([away_u / distances, away_v / distances, residual])
             normal = (rows * weights) @ rows.T
+            # Normal equations (a b; b c) (du, dv) = (p, q), solved by Cramer's rule.
             (a, b, p), (_, c, q), _ = normal.tolist()
-            area = a * c - b * b
-            if area < _MIN_DETERMINANT:
+            determinant = a * c - b * b
+            if determinant < _MIN_DETERMINANT:
                 return self
-            # Cramer's rule
-            du = (c * p - b * q) / area
-            dv = (a * q - b * p) / area
+            du = (c * p - b * q) / determinant
+            dv = (a * q - b * p) / determinant
             u += du
             v += dv
             if abs(du) + abs(dv) < _CENTRE_TOLERANCE:
                 break
-        # The fit has moved to the edge of another object.
         if np.hypot(u - self.u, v - self.v) > 0.5 * radius:
             return self
         return self._replace(u=u, v=v)
@@ -154,9 +156,11 @@ class BallDetector:
     """Detector of round objects in pictures of one scene."""
 
     def __init__(self, background: RgbImage, sigma: float, shadows: bool) -> None:
-        """Precompute what every frame is compared with: grey and squared background, and threshold.
+        """Precompute what every frame is compared with.
 
-        `level` is the difference, in grey levels, from which a pixel counts as changed.
+        `level` is the difference, in grey levels, from which a pixel counts as changed. `_plain` is
+        the background as floats, `_grey` its brightness, and `_square` its squared length in colour
+        space, at least 1.
 
         Args:
             background: Scene without the ball.
@@ -176,15 +180,15 @@ class BallDetector:
         self._square = np.maximum(squares, 1.0)
 
     def detect(self, picture: RgbImage, ghosts: bool = False) -> list[BallDetection]:
-        """Detect round objects in a picture, the largest first.
+        """Detect round objects in a picture, those in the largest regions first.
 
         Pixels that differ clearly from the background image are joined to regions, without shadows
-        if `shadows` is set; each region is then measured in detail.
+        if `shadows` is set. A circle is then fitted to each of the largest regions.
 
         Args:
             picture: Picture (height, width, 3).
             ghosts: Whether to include objects that only the background image has, such as a ball
-                that lay there when the background was taken.
+                that lay there in the frames from which the background was estimated.
         """
         cv2 = import_package("cv2")
         difference = self._compute_largest_difference(picture)
@@ -203,9 +207,9 @@ class BallDetector:
             shadow_mask = np.zeros(mask.shape, bool)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         lengths = [(len(c), i) for i, c in enumerate(contours) if len(c) > 3]
-        largest_regions = sorted(lengths, reverse=True)[:_MAX_REGIONS]
+        longest_contours = sorted(lengths, reverse=True)[:_MAX_REGIONS]
         detections = []
-        for _, i in largest_regions:
+        for _, i in longest_contours:
             detection = self._measure_object(contours[i], (brightness, difference), shadow_mask)
             if detection is not None:
                 detections.append(self._add_colour(detection, picture))
@@ -214,7 +218,9 @@ class BallDetector:
         return [detection for detection in detections if not detection.is_ghost]
 
     def _add_colour(self, detection: BallDetection, picture: RgbImage) -> BallDetection:
-        """Add to a detection its colour, its contrast, and whether it is a background artefact.
+        """Add to a detection its colour, its contrast, and whether it is a ghost.
+
+        A ghost is an object in the background image that the picture lacks.
 
         Args:
             detection: the detection.
@@ -225,36 +231,44 @@ class BallDetector:
         surrounding_colour = _compute_surrounding_colour(picture, detection)
         background_surrounding = _compute_surrounding_colour(self.background, detection)
         contrast = float(np.abs(centre_colour - background_colour).max())
-        ghost = self._is_ghost(
+        is_ghost = self._is_ghost(
             (centre_colour, surrounding_colour), (background_colour, background_surrounding)
         )
         return detection._replace(
-            colour=tuple(centre_colour.tolist()), contrast=contrast, is_ghost=ghost
+            colour=tuple(centre_colour.tolist()), contrast=contrast, is_ghost=is_ghost
         )
 
     def find_missing_shadow(self, picture: RgbImage) -> Mask:
-        """Find where the background image has a shadow that the picture lacks, as a mask.
+        """Find where the background image has a shadow that the picture lacks.
 
-        The background is a median over frames, so that a ball that rests long leaves its
-        shadow in it. Such places are lighter in the picture than in the background.
+        The background is a median over frames, so that a ball that rests long leaves its shadow in
+        it. Regions with a missing shadow are lighter in the picture than in the background by the
+        same factor in all colours, and do not stand out from their surroundings in the picture.
+
+        Args:
+            picture: Picture (height, width, 3).
+
+        Returns:
+            Mask (height, width) of these regions.
         """
         cv2 = import_package("cv2")
         mask = (self._compute_largest_difference(picture) > self.level).astype(np.uint8)
         lighter = (self._compute_brightness_ratio(picture, mask) > 1).astype(np.uint8)
-        count, parts, sizes, _ = cv2.connectedComponentsWithStats(lighter)
+        count, labels, statistics, _ = cv2.connectedComponentsWithStats(lighter)
         missing_shadow = np.zeros(mask.shape, bool)
         # Component 0 is the area between the others.
-        for part in range(1, count):
-            if sizes[part, cv2.CC_STAT_AREA] < _MIN_REGION_AREA:
+        for label in range(1, count):
+            if statistics[label, cv2.CC_STAT_AREA] < _MIN_REGION_AREA:
                 continue
-            part_mask = (parts == part).astype(np.uint8)
-            # Leave out one pixel between inside and ring, which is half one and half the other.
-            grown_mask = cv2.dilate(part_mask, np.ones((3, 3), np.uint8))
+            region_mask = (labels == label).astype(np.uint8)
+            # The surroundings are a ring of unchanged pixels. One pixel between region and ring is
+            # left out, since it is half one and half the other.
+            grown_mask = cv2.dilate(region_mask, np.ones((3, 3), np.uint8))
             outer_mask = cv2.dilate(grown_mask, np.ones((5, 5), np.uint8))
             ring = (outer_mask > 0) & (grown_mask == 0) & (mask == 0)
             if not ring.any():
                 continue
-            is_inside = part_mask > 0
+            is_inside = region_mask > 0
             picture_colours = _compute_median_colours(picture, is_inside, ring)
             background_colours = _compute_median_colours(self.background, is_inside, ring)
             # A pale ball is lighter, too, but it stands out in the picture.
@@ -267,13 +281,17 @@ class BallDetector:
     ) -> bool:
         """Return whether an object is in the background image and not in the picture.
 
+        There it differs more from its surroundings than in the picture.
+
         Args:
-            picture_colours: Colours inside and around the object in the picture.
-            background_colours: Colours there in the background image.
+            picture_colours: Colours (3,) inside and around the object in the picture.
+            background_colours: Colours (3,) at the same pixels of the background image.
         """
-        stands_out = float(np.abs(picture_colours[0] - picture_colours[1]).max())
-        stood_out = float(np.abs(background_colours[0] - background_colours[1]).max())
-        return stood_out > stands_out + self.level / 2
+        inside, surroundings = picture_colours
+        background_inside, background_surroundings = background_colours
+        picture_contrast = float(np.abs(inside - surroundings).max())
+        background_contrast = float(np.abs(background_inside - background_surroundings).max())
+        return background_contrast > picture_contrast + self.level / 2
 
     def _compute_largest_difference(self, picture: RgbImage) -> NDArray[np.uint8]:
         """Return the largest difference from the background over the colours (height, width)."""
@@ -286,11 +304,13 @@ class BallDetector:
     def _compute_brightness_ratio(self, picture: RgbImage, mask: NDArray[np.uint8]) -> GreyLevels:
         """Return the factor between picture and background where it is the same in all colours.
 
-        The factor is below 1 in shadow, above 1 where the picture lacks a shadow, and 0 elsewhere.
-
         Args:
             picture: picture (height, width, 3).
             mask: (height, width) pixels that differ from the background.
+
+        Returns:
+            (height, width) factor: below 1 in shadow, above 1 where the picture lacks a shadow of
+            the background, and 0 where the difference is not that of a shadow.
         """
         brightness_ratio = np.zeros(mask.shape, np.float32)
         rows, columns = np.nonzero(mask)
@@ -300,13 +320,14 @@ class BallDetector:
         product = (colours * background_colours).sum(axis=1)
         factor = product / self._square[rows, columns]
         deviations = np.abs(colours - factor[:, None] * background_colours).max(axis=1)
-        relative_deviations = deviations / np.maximum(factor, 1)
-        # A missing shadow is judged by the inverse factor.
-        symmetric_factor = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
+        # Relative to the lighter of both, where a shadow is missing.
+        scaled_deviations = deviations / np.maximum(factor, 1)
+        # Brightness of the darker of both relative to the lighter one.
+        shadow_factor = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
         darkest, lightest = _SHADOW_FACTOR_RANGE
-        shade = (symmetric_factor > darkest) & (symmetric_factor < lightest)
-        shade &= relative_deviations < max(_MAX_SHADOW_DEVIATION, 3 * self.sigma)
-        brightness_ratio[rows, columns] = np.where(shade, factor, 0)
+        is_shadow = (shadow_factor > darkest) & (shadow_factor < lightest)
+        is_shadow &= scaled_deviations < max(_MAX_SHADOW_DEVIATION, 3 * self.sigma)
+        brightness_ratio[rows, columns] = np.where(is_shadow, factor, 0)
         return brightness_ratio
 
     def _measure_object(
@@ -315,18 +336,26 @@ class BallDetector:
         differences: tuple[NDArray[np.uint8], ...],
         shade: Mask,
     ) -> BallDetection | None:
-        """Measure the object inside a contour; None if it is not round.
+        """Measure the centre and the radius of the object inside a contour.
+
+        The largest disc inside the contour gives a first estimate. The object is then measured in a
+        window around it: by a circle through its edge, or if it has a few pixels only, by sums.
 
         Args:
             contour: Contour of the region.
-            differences: Differences of brightness and of the worst colour (height, width).
+            differences: Differences from the background (height, width): of brightness, and of the
+                colour that differs most.
             shade: Mask of the shadow (height, width).
+
+        Returns:
+            The detection in the picture, without colours; None if the object is not round.
         """
         cv2 = import_package("cv2")
         left, top, width, height = cv2.boundingRect(contour)
         # An object that nearly fills the picture is not a ball in front of a background.
         if width * height < _MIN_REGION_AREA or max(width, height) > 0.9 * min(shade.shape):
             return None
+        # The region with a border of one pixel.
         filled = np.zeros((height + 2, width + 2), np.uint8)
         offset = 1 - left, 1 - top
         cv2.drawContours(filled, [contour], -1, 1, -1, offset=offset)
@@ -338,7 +367,7 @@ class BallDetector:
         radius = max(float(distance_map[row, column]), 1.0)
         u = left + float(column) - 1
         v = top + float(row) - 1
-        # Use a window around it in which shadow counts as background unless the region encloses it.
+        # In the window, shadow counts as background unless the region encloses it.
         half_size = int(2 * max(radius, 0.5 * max(width, height))) + 4
         u0 = max(0, int(u) - half_size)
         v0 = max(0, int(v) - half_size)
@@ -361,15 +390,15 @@ class BallDetector:
         u0: int,
         v0: int,
     ) -> BallDetection | None:
-        """Fit a circle to the edge points along rays, in turn with finding the edge again.
+        """Measure a ball by alternating between locating its edge and fitting a circle to it.
 
         Edge points are located along rays from the present centre, a robust circle is fitted to
         them, and this is repeated until the circle moves by less than `_CONVERGED_PIXELS`. If too
-        few rays agree, a circle through an arc is tried.
+        few points are on the circle, a fit that starts from a circle through an arc is tried.
 
         Args:
             windows: (2, height, width) differences from the background around the region: of
-                brightness, and of the worst colour.
+                brightness, and of the colour that differs most.
             start: first estimate of centre and radius in pixels, in the window.
             u0: first column of the window in the picture.
             v0: first row of the window in the picture.
@@ -386,11 +415,11 @@ class BallDetector:
             if edges is None:
                 return None
             fitted = circle_fit.fit_circle(edges, (u, v, None))
-            has_enough_points = (
+            is_good = (
                 fitted is not None
                 and circle_fit.find_inliers(fitted).sum() >= _GOOD_RAY_AGREEMENT * _RAY_COUNT
             )
-            if not has_enough_points:
+            if not is_good:
                 from_an_arc = circle_fit.fit_circle(edges, circle_fit.fit_arc(edges))
                 fitted = circle_fit.select_better_fit(fitted, from_an_arc)
             if fitted is None:
@@ -405,8 +434,7 @@ class BallDetector:
         agreement = float(is_on_circle.sum()) / _RAY_COUNT
         height, width = windows.shape[1:]
         # A centre outside the window belongs to an arc of a large object.
-        is_within = -0.5 <= u <= width - 0.5
-        is_within &= -0.5 <= v <= height - 0.5
+        is_within = -0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5
         if edges is None or agreement < _MIN_RAY_AGREEMENT or not is_within:
             return None
         scatter = float(np.sqrt(np.mean(residuals[is_on_circle] ** 2)))
@@ -414,28 +442,33 @@ class BallDetector:
         return BallDetection(u + u0, v + v0, radius, agreement, scatter, picture_edges)
 
     def _locate_edges(self, windows: GreyLevels, u: float, v: float, radius: float) -> Array | None:
-        """Locate the points (n, 2) where the difference falls to half along rays from (u, v).
+        """Locate the edge of a ball along rays from its centre, with subpixel accuracy.
 
-        The reference value is taken just inside the edge, because the brightness of a lit ball
-        varies. Brightness is used where it differs enough: video files store colours at half the
-        resolution.
+        Along each ray, the edge is where the difference from the background falls to half of its
+        value just inside the edge. That value is taken for each ray, because the brightness of a
+        lit ball varies. The difference of brightness is used where it is large enough, because
+        video files store colours at half the resolution; otherwise that of the worst colour.
 
         Args:
-            windows: Differences of brightness and of the worst colour (2, height, width).
+            windows: (2, height, width) differences from the background: of brightness, and of the
+                worst colour, which is the one that differs most.
             u: Horizontal position of the centre in the window, pixels.
             v: Vertical position of the centre in the window, pixels.
             radius: Approximate radius, pixels.
 
         Returns:
-            Edge points in the window; None if there are too few.
+            (n, 2) edge points in the window, for the rays with an edge; None if they are less than
+            half of the rays.
         """
         start = max(0.0, _RAY_SHARES[0] * radius - _RAY_MARGIN)
         end = _RAY_SHARES[1] * radius + _RAY_MARGIN
         distances = np.arange(start, end, _RAY_SAMPLE_SPACING, dtype=np.float32)
         cos, sin = _compute_ray_directions()
+        # (rays, samples of a ray) positions.
         along_u = (u + cos * distances).astype(np.float32)
         along_v = (v + sin * distances).astype(np.float32)
         cv2 = import_package("cv2")
+        # Differences along the rays.
         profiles = [
             cv2.remap(
                 window,
@@ -447,22 +480,21 @@ class BallDetector:
             )
             for window in windows
         ]
-        # Last pixels inside the edge, except those affected by blur.
+        # Samples just inside the edge, except those affected by its blur. Their median is the value
+        # inside, for each ray.
         is_inner = distances > min(_INNER_SHARES[0] * radius, radius - _INNER_MARGINS[0])
         is_inner &= distances < max(_INNER_SHARES[1] * radius, radius - _INNER_MARGINS[1])
         median_index = int(is_inner.sum()) // 2
-        levels = []
-        for profile in profiles:
-            ranked = np.partition(profile[:, is_inner], median_index, axis=1)
-            levels.append(ranked[:, median_index])
-        brightness, worst = levels
-        is_bright = brightness > _MIN_BRIGHTNESS_LEVELS * self.level
-        is_bright &= brightness > _MIN_BRIGHTNESS_SHARE * worst
+        inner_brightness, inner_colour = (
+            np.partition(profile[:, is_inner], median_index, axis=1)[:, median_index]
+            for profile in profiles
+        )
+        is_bright = inner_brightness > _MIN_BRIGHTNESS_LEVELS * self.level
+        is_bright &= inner_brightness > _MIN_BRIGHTNESS_SHARE * inner_colour
         values = np.where(is_bright[:, None], *profiles)
-        half_level = 0.5 * np.where(is_bright, brightness, worst)
-        crossing_level = half_level[:, None]
-        is_crossing = values[:, 1:] < crossing_level
-        is_crossing &= values[:, :-1] >= crossing_level
+        half_level = 0.5 * np.where(is_bright, inner_brightness, inner_colour)
+        is_crossing = values[:, 1:] < half_level[:, None]
+        is_crossing &= values[:, :-1] >= half_level[:, None]
         # A dark patch further inside is not an edge.
         is_crossing[:, : int(np.flatnonzero(is_inner)[0])] = False
         # Take the first of several crossings.
@@ -495,12 +527,13 @@ class BallDetector:
         """Measure a ball of a few pixels: centroid of the difference, and radius from its sum.
 
         Args:
-            window: (height, width) differences from the background, grey levels.
-            u: horizontal position of the centre in the window, pixels.
-            v: vertical position of the centre in the window, pixels.
+            window: (height, width) differences of the worst colour from the background, grey
+                levels.
+            u: approximate horizontal position of the centre in the window, pixels.
+            v: approximate vertical position of the centre in the window, pixels.
             radius: approximate radius, pixels.
-            u0: left edge of the window in the picture.
-            v0: upper edge of the window in the picture.
+            u0: first column of the window in the picture.
+            v0: first row of the window in the picture.
 
         Returns:
             The detection in the picture; None if the difference is too small.
@@ -510,6 +543,7 @@ class BallDetector:
         is_near = np.hypot(columns - u, rows - v) <= radius + _SMALL_BALL_MARGIN
         weights = np.where(is_near & (window > _MIN_EDGE_LEVELS * self.level), window, 0.0)
         total = float(weights.sum())
+        # Difference of a pixel that the ball covers, robust against single pixels.
         peak = float(np.percentile(window[is_near], 90))
         if total <= 0 or peak < self.level:
             return None
@@ -519,15 +553,16 @@ class BallDetector:
             return None
         u = u0 + float((weights * columns).sum() / total)
         v = v0 + float((weights * rows).sum() / total)
-        equal = float(np.sqrt(area / np.pi))
-        # Without rays there is no agreement; assume that of the worst accepted circle.
-        return BallDetection(u, v, equal, _MIN_RAY_AGREEMENT, 0.2)
+        radius = float(np.sqrt(area / np.pi))
+        # Without rays there is no agreement; assume that of the worst accepted circle, and a usual
+        # distance of edge points from a circle.
+        return BallDetection(u, v, radius, _MIN_RAY_AGREEMENT, scatter=0.2)
 
 
 def _compute_median_colours(
     picture: RgbImage, object_mask: Mask, surroundings: Mask
 ) -> tuple[Array, Array]:
-    """Return the median colours (3,) of two parts of a picture.
+    """Return the median colours (3,) of an object and of its surroundings in a picture.
 
     Args:
         picture: picture (height, width, 3).
@@ -540,7 +575,7 @@ def _compute_median_colours(
 
 
 def _compute_centre_colour(picture: RgbImage, detection: BallDetection) -> Array:
-    """Return the mean colour (3,) at a detection's centre.
+    """Return the mean colour (3,) of a square patch at a detection's centre, in grey levels.
 
     Args:
         picture: picture (height, width, 3).

@@ -63,10 +63,13 @@ class SceneAppearance:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> SceneAppearance:
-        """Draw a random appearance.
+        """Draw a random appearance: light, colours, pattern of the ground, shadow, noise.
 
         The light is 30 to 80 degrees above the ground, and the colours of ball and ground are
         distinguishable.
+
+        Args:
+            rng: Random number generator.
         """
         # The order of the draws must not change, because it determines the result of a seed.
         azimuth = rng.uniform(0, 2 * np.pi)
@@ -141,7 +144,7 @@ def make_sphere_mesh() -> tuple[Array, tuple[int, ...]]:
         triangle, anticlockwise as seen from outside.
     """
     golden = (1 + 5**0.5) / 2
-    # Corners of three golden rectangles at right angles.
+    # The 12 corners of an icosahedron are those of three golden rectangles at right angles.
     corners = np.array([(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)])
     points = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
     points /= np.hypot(1, golden)
@@ -152,6 +155,7 @@ def make_sphere_mesh() -> tuple[Array, tuple[int, ...]]:
         middles /= np.linalg.norm(middles, axis=1, keepdims=True)
         points = np.concatenate([points, middles])
     faces = ConvexHull(points).simplices
+    # Order the corners of each face such that its normal points outwards.
     a, b, c = points[faces.T]
     is_inward = (np.cross(b - a, c - a) * a).sum(axis=1) < 0
     faces[is_inward] = faces[is_inward, ::-1]
@@ -202,6 +206,9 @@ class BallScene:
     ) -> None:
         """Render the background once, and create the ball's mesh.
 
+        `_client` is the number of PyBullet's renderer, `_rays` the viewing direction of each pixel,
+        `_background` the scene without the ball, and `_ball` the body of the ball.
+
         Args:
             camera: Camera that does not move.
             appearance: Colours, light and noise of the pictures.
@@ -221,10 +228,10 @@ class BallScene:
         width, height = camera.size
         full_window = 0, 0, width, height
         self._rays = self._compute_view_directions()
-        picture, covered = self._render_body(full_window, 1, ground)
+        picture, coverage = self._render_body(full_window, 1, ground)
         # Frames are rendered without the ground, because it does not change.
         pybullet.removeBody(ground, physicsClientId=self._client)
-        self._background = self._render_background(picture, covered)
+        self._background = self._render_background(picture, coverage)
         points, faces = make_sphere_mesh()
         self._ball = self._create_body(
             pybullet.GEOM_MESH,
@@ -240,7 +247,10 @@ class BallScene:
         return (self.render_frame(np.asarray(position, dtype=np.float64)) for position in positions)
 
     def render_frame(self, position: Array) -> RgbImage:
-        """Render a frame with the ball's centre at `position` (3,), m.
+        """Render one frame of the film.
+
+        Args:
+            position: (3,) centre of the ball, m.
 
         Returns:
             Picture (height, width, 3) with shadow, ball and noise.
@@ -262,7 +272,7 @@ class BallScene:
         )
 
     def _create_body(self, shape: int, colour: tuple[float, float, float], **size: object) -> int:
-        """Create a body that is only drawn; `size` are the arguments of Bullet's shape.
+        """Create a body that is only drawn, without mass and collisions, and return its id.
 
         Args:
             shape: Bullet's constant of the shape, such as `GEOM_BOX`.
@@ -276,37 +286,41 @@ class BallScene:
             physicsClientId=self._client,
             **size,
         )
-        # No mass and no collision shape, because nothing is simulated here.
+        # No mass and no collision shape (-1), because nothing is simulated here.
         body: int = pybullet.createMultiBody(0.0, -1, visual, physicsClientId=self._client)
         return body
 
     def _compute_view_directions(self) -> Array:
         """Return the viewing direction of each pixel as world vectors (height, width, 3).
 
-        The vectors have length 1 along the camera's forward axis, not unit length.
+        They are the inverse of the projection at depth 1: their component along the camera's
+        forward axis is 1, so they are longer than unit vectors.
         """
-        v, u = np.mgrid[: self.camera.size[1], : self.camera.size[0]]
+        width, height = self.camera.size
+        v, u = np.mgrid[:height, :width]
         right, down, forward = self.camera.axes
-        # Inverse of the projection u = middle_u + focal a / depth, at depth 1 (likewise v with b).
         middle_u, middle_v = self.camera.principal_point
-        a = (u - middle_u) / self.camera.focal
-        b = (v - middle_v) / self.camera.focal
-        result: Array = a[..., None] * right + b[..., None] * down + forward
+        x = (u - middle_u) / self.camera.focal
+        y = (v - middle_v) / self.camera.focal
+        result: Array = x[..., None] * right + y[..., None] * down + forward
         return result
 
-    def _render_background(self, picture: ColourArray, covered: ColourArray) -> ColourArray:
+    def _render_background(self, picture: ColourArray, coverage: ColourArray) -> ColourArray:
         """Return the scene without the ball, and store the visible ground points for shadows.
 
+        `_points` (height, width, 3) has the ground point that each pixel shows in m, and `_open`
+        (height, width) whether it shows the ground and not the sky.
+
         Args:
-            picture: Rendered ground.
-            covered: Fraction of each pixel that the ground covers.
+            picture: (height, width, 3) rendered ground.
+            coverage: (height, width, 1) fraction of each pixel that the ground covers.
         """
         # A ray meets the ground at height 0.
         with np.errstate(divide="ignore"):
             ground_distance = -self.camera.position[2] / self._rays[..., 2]
         # Without the second condition, rays above the horizon would meet the ground behind the
         # camera.
-        is_ground = (covered[..., 0] > 0.5) & (ground_distance > 0)
+        is_ground = (coverage[..., 0] > 0.5) & (ground_distance > 0)
         ray_lengths = np.where(is_ground, ground_distance, 0.0)
         points = self.camera.position + ray_lengths[..., None] * self._rays
         self._points = points.astype(np.float32)
@@ -317,26 +331,24 @@ class BallScene:
         return np.where(is_ground[..., None], ground, sky).astype(np.float32)
 
     def _cast_shadow(self, picture: ColourArray, position: Array) -> None:
-        """Darken the ground in the ball's shadow; the sun's disc softens its edge.
+        """Darken the ground in the ball's shadow.
+
+        A ground point is in the shadow if it is closer than the ball's radius to the line through
+        the ball's centre along the light. The sun's disc softens the edge, the more the higher the
+        ball is.
 
         Args:
-            picture: (height, width, 3) linear colours, changed in place.
+            picture: (height, width, 3) colours in grey levels, changed in place.
             position: (3,) centre of the ball in the world, m.
         """
         light = self.appearance.light
         slant = 1 / light[2]
+        # Distance from the ball to the ground along the light, m.
         travel = position[2] / light[2]
-        # Intersection of the ground with the line through the ball's centre along the light.
         shadow_centre = position - travel * light
-        signs = np.array(
-            [
-                (-1, -1, 0.0),
-                (-1, 1, 0.0),
-                (1, -1, 0.0),
-                (1, 1, 0.0),
-            ]
-        )
-        # Slanting light stretches the disc to an ellipse.
+        # A square around the shadow: slanting light stretches the disc to an ellipse, and a tenth
+        # is added for the soft edge.
+        signs = np.array([(-1, -1, 0.0), (-1, 1, 0.0), (1, -1, 0.0), (1, 1, 0.0)])
         corners = shadow_centre + self.radius * slant * 1.1 * signs
         window = _find_window(self.camera.project(corners), self.camera.size)
         if window is None:
@@ -350,6 +362,7 @@ class BallScene:
         squares = squared_distances - light_components * light_components
         distance = np.sqrt(np.maximum(squares, 0))
         edge_half_width = _MIN_SHADOW_EDGE * self.radius + _SUN_ANGLE * travel
+        # 0 outside the shadow, 1 inside, and linear across its edge; the sky has no shadow.
         depth = (self.radius + edge_half_width - distance) / (2 * edge_half_width)
         shadow = np.clip(depth, 0, 1) * self._open[window_slice]
         brightness = 1 - self.appearance.shadow * shadow
@@ -362,7 +375,7 @@ class BallScene:
         ball behind the camera or outside the picture changes nothing.
 
         Args:
-            picture: (height, width, 3) linear colours, changed in place.
+            picture: (height, width, 3) colours in grey levels, changed in place.
             position: (3,) centre of the ball in the world, m.
         """
         centre, (semi_major_axis, _) = self.camera.project_sphere(position, self.radius)
@@ -375,10 +388,10 @@ class BallScene:
             return
         self._move_body(self._ball, position)
         oversampling = 3 if semi_major_axis < _FINE_RENDER_RADIUS else 2
-        ball, covered = self._render_body(window, oversampling, self._ball)
+        ball, coverage = self._render_body(window, oversampling, self._ball)
         left, top, right, bottom = window
         window_slice = np.s_[top:bottom, left:right]
-        picture[window_slice] = covered * ball + (1 - covered) * picture[window_slice]
+        picture[window_slice] = coverage * ball + (1 - coverage) * picture[window_slice]
 
     def _render_body(
         self, window: PixelWindow, oversampling: int, body: int
@@ -389,19 +402,20 @@ class BallScene:
         averaged, so that edges are smooth.
 
         Args:
-            window: Window (left, top, right, bottom).
-            oversampling: Factor of oversampling.
+            window: Window (left, top, right, bottom) in pixels.
+            oversampling: Number of fine pixels per pixel in each direction.
             body: Id of the body.
 
         Returns:
-            Mean colours of the body (height, width, 3), and its coverage (height, width, 1).
+            Mean colours of the body in grey levels (height, width, 3), and the fraction of each
+            pixel that it covers (height, width, 1).
         """
         pybullet = bullet_world.import_pybullet()
         camera = self.camera
         left, top, right, bottom = window
         width = right - left
         height = bottom - top
-        # size of a pixel on the near plane in metres
+        # Size of a pixel on the near plane, m.
         pixel_size = _NEAR_PLANE / camera.focal
         # The renderer counts pixels from their corner: shift by half a fine pixel, measured on
         # spheres.
@@ -435,25 +449,29 @@ class BallScene:
         grouped = height, oversampling, width, oversampling
         is_body = np.reshape(bodies, (*grouped, 1)) == body
         coverage = is_body.mean(axis=(1, 3), dtype=np.float32)
-        colour = np.reshape(colours, (*grouped, 4))[..., :3]
+        colour = np.reshape(colours, (*grouped, 4))[..., :3]  # without transparency
         sums = np.where(is_body, colour, 0).sum(axis=(1, 3), dtype=np.float32)
         count = np.maximum(coverage * oversampling**2, 1)
         return sums / count, coverage
 
 
 def _find_window(pixels: Array, size: tuple[int, int]) -> PixelWindow | None:
-    """Return the window of the picture that contains some pixels; None if they are outside.
+    """Return the smallest window of the picture that contains some positions.
 
     Args:
-        pixels: (n, 2) positions of the pixels.
-        size: width and height of the picture.
+        pixels: (n, 2) positions in pixels; they may be outside the picture.
+        size: width and height of the picture, pixels.
+
+    Returns:
+        The window; None if all positions are outside on one side, or one of them is not finite.
     """
     if not np.isfinite(pixels).all():
         return None
-    left, top = (max(0, math.floor(x)) for x in pixels.min(axis=0))
-    last_u, last_v = pixels.max(axis=0)
-    right = min(size[0], math.ceil(last_u) + 1)
-    bottom = min(size[1], math.ceil(last_v) + 1)
+    width, height = size
+    (first_u, first_v), (last_u, last_v) = pixels.min(axis=0), pixels.max(axis=0)
+    left, top = max(0, math.floor(first_u)), max(0, math.floor(first_v))
+    right = min(width, math.ceil(last_u) + 1)
+    bottom = min(height, math.ceil(last_v) + 1)
     if left < right and top < bottom:
         return left, top, right, bottom
     return None

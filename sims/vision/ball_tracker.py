@@ -70,43 +70,45 @@ class TrackedPath:
         self.detections.append(detection)
 
     def predict(self, frame: int) -> tuple[float, float, float]:
-        """Predict the position in a frame by linear extrapolation.
+        """Predict the position in a frame by linear extrapolation of the last two detections.
 
-        With a single detection there is no velocity; then the ball may be up to 4 radii and
-        10 pixels away.
+        A single detection shows no velocity; its position is returned, and the ball may be up to
+        4 radii and 10 pixels away.
 
         Args:
             frame: Number of the frame.
 
         Returns:
-            Position (u, v), and the maximum distance of a detection from it, which allows for a
+            Position u and v, and the maximum distance of a detection from it, which allows for a
             bounce; pixels.
         """
-        last_detection = self.detections[-1]
-        u, v = last_detection.u, last_detection.v
-        # A single detection has no direction.
+        last = self.detections[-1]
         if len(self.detections) < 2:
-            return u, v, 4 * last_detection.radius + 10
+            return last.u, last.v, 4 * last.radius + 10
         previous = self.detections[-2]
-        gap = self.frames[-1] - self.frames[-2]
-        du = (u - previous.u) / gap
-        dv = (v - previous.v) / gap
-        frame_gap = frame - self.frames[-1]
+        frames_between = self.frames[-1] - self.frames[-2]
+        # Velocity in pixels per frame.
+        du = (last.u - previous.u) / frames_between
+        dv = (last.v - previous.v) / frames_between
+        frames_ahead = frame - self.frames[-1]
         # Twice the distance covered: an object that reverses is that far from its prediction.
-        speed = float(np.hypot(du, dv))
-        reach = 2 * speed * frame_gap + last_detection.radius + 2
-        return u + du * frame_gap, v + dv * frame_gap, reach
+        reach = 2 * float(np.hypot(du, dv)) * frames_ahead + last.radius + 2
+        return last.u + du * frames_ahead, last.v + dv * frames_ahead, reach
 
     def compute_distance(self, frame: int, detection: BallDetection) -> float:
-        """Return the distance of a detection from this path as a fraction of the allowed one.
+        """Return how far a detection is from continuing this path.
 
-        Position, radius and colour count; the result is infinite for another object. Colour
-        separates a ball from its shadow where they meet and the shadow continues as the ball moved
-        before.
+        It is the distance from the predicted position plus the difference from the mean colour,
+        each as a fraction of the largest allowed one. Colour separates a ball from its shadow where
+        they meet and the shadow continues as the ball moved before.
 
         Args:
             frame: Number of the frame.
             detection: Detection in that frame.
+
+        Returns:
+            Distance from 0 to 2; infinite if position, radius or colour are those of another
+            object.
         """
         u, v, reach = self.predict(frame)
         position_distance = float(np.hypot(detection.u - u, detection.v - v)) / reach
@@ -119,18 +121,19 @@ class TrackedPath:
         return position_distance + colour_distance if colour_distance <= 1 else np.inf
 
     def compute_colour_distance(self, colour: Sequence[float], contrast: float) -> float:
-        """Return the difference of a colour from that of the path as a fraction of the tolerance.
+        """Return the difference of a colour from the mean colour of the path.
 
-        The tolerance allows for light and compression.
+        It is the largest difference of the three colours as a fraction of a tolerance, which allows
+        for changes of the light, for compression, and for a share of the larger contrast.
 
         Args:
-            colour: Red, green, blue, grey levels.
-            contrast: Contrast with the background of the object of that colour, grey levels.
+            colour: Red, green and blue of an object, grey levels.
+            contrast: Contrast of that object with the background, grey levels.
         """
         # The smaller the ball, the more of it is mixed with the background.
-        tinge = _COLOUR_TOLERANCE * (1.0 + _CHROMA_BLUR_PIXELS / self.detections[-1].radius)
+        min_tolerance = _COLOUR_TOLERANCE * (1.0 + _CHROMA_BLUR_PIXELS / self.detections[-1].radius)
         tolerance = max(
-            tinge,
+            min_tolerance,
             _CONTRAST_TOLERANCE_SHARE * contrast,
             _CONTRAST_TOLERANCE_SHARE * self.contrast,
         )
@@ -160,9 +163,10 @@ class TrackedPath:
 
     @property
     def evidence(self) -> float:
-        """Evidence for the path: length of edge on circles beyond chance level, in pixels.
+        """Evidence for the path: length of edge on circles beyond that of random edges, in pixels.
 
-        A count of frames alone would prefer a permanent remnant of shadow to a ball.
+        It grows with the number, the roundness and the radius of the detections. A count of frames
+        alone would prefer a permanent remnant of shadow to a ball.
         """
         return sum(
             (detection.ray_agreement - _RANDOM_RAY_AGREEMENT) * detection.radius
@@ -171,10 +175,16 @@ class TrackedPath:
 
 
 def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[TrackedPath]:
-    """Link detections to paths, the best path first; short paths are left out.
+    """Link the detections in successive frames to paths, one for each object.
+
+    A path ends if its object is missed in more than `_MAX_MISSED_FRAMES` successive frames. Paths
+    of fewer than `_MIN_PATH_FRAMES` frames are left out.
 
     Args:
         pictures: Detections in each frame.
+
+    Returns:
+        Paths, the one with most evidence first; objects that hardly move come last.
     """
     finished_paths: list[TrackedPath] = []
     active_paths: list[TrackedPath] = []
@@ -187,32 +197,33 @@ def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[Tracked
         ]
         used_detections = _extend_paths(active_paths, frame, detections)
         # Each remaining detection begins a new path.
-        for k, detection in enumerate(detections):
-            if k not in used_detections:
+        for index, detection in enumerate(detections):
+            if index not in used_detections:
                 path = TrackedPath()
                 path.append(frame, detection)
                 active_paths.append(path)
     paths = [path for path in finished_paths + active_paths if len(path.frames) >= _MIN_PATH_FRAMES]
-    # Objects that do not move come last, regardless of their evidence.
+    # An object that travels less than its radius counts as one without evidence.
     return sorted(paths, key=lambda path: -path.evidence * (path.travel > path.radius))
 
 
 def _extend_paths(
     active_paths: Sequence[TrackedPath], frame: int, detections: Sequence[BallDetection]
 ) -> set[int]:
-    """Append each detection in a frame to the path that it fits best, nearest pairs first.
+    """Append each detection in a frame to the path that it fits best.
 
-    Each path predicts where its object would be; the distance is infinite if a detection cannot be
-    that object.
+    All pairs of a path and a detection are taken in the order of their distance. A path gets at
+    most one detection, and a detection is appended to at most one path.
 
     Args:
-        active_paths: Paths that may continue.
+        active_paths: Paths that may continue, extended in place.
         frame: Number of the frame.
         detections: Detections in that frame.
 
     Returns:
-        Numbers of the detections that were appended.
+        Indices of the detections that were appended.
     """
+    # Distances of the detections that may be the object of a path.
     pairs = []
     for path_index, path in enumerate(active_paths):
         for detection_index, detection in enumerate(detections):
@@ -221,7 +232,6 @@ def _extend_paths(
                 pairs.append((distance, path_index, detection_index))
     extended_paths: set[int] = set()
     used_detections: set[int] = set()
-    # Nearest pairs first: a path gets one detection, and a detection one path.
     for _, path_index, detection_index in sorted(pairs):
         if path_index in extended_paths or detection_index in used_detections:
             continue
@@ -234,14 +244,15 @@ def _extend_paths(
 def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list[TrackedPath]]:
     """Merge the first path with those that continue it after it was lost from view.
 
-    A path continues it if it shows a ball of similar size and colour near the same line, in other
-    frames.
+    A path continues the first one if it has a similar radius and colour, lies near the straight
+    line fitted to the first one, and has no frame in common with it: a ball is in one place at a
+    time.
 
     Args:
         paths: Paths, the best first.
 
     Returns:
-        The merged path, and the other paths.
+        The merged path, ordered by frames, and the other paths.
     """
     main = paths[0]
     other_paths = []
@@ -249,7 +260,6 @@ def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list
     detections = list(main.detections)
     low, high = _RADIUS_RATIO_RANGE
     for path in paths[1:]:
-        # A ball is in one place: a detection in the same frame is another object.
         is_disjoint = not set(path.frames) & set(frames)
         is_similar = low < path.radius / main.radius < high
         is_similar &= main.compute_colour_distance(path.mean_colour.tolist(), path.contrast) <= 1
@@ -276,7 +286,7 @@ def _compute_median_distance(line: Array, points: Array) -> float:
         points: Points (m, 2).
     """
     middle = line.mean(axis=0)
-    # The last axis is perpendicular to the line: along it, the points differ least.
+    # The last principal axis is perpendicular to the line: along it, the points differ least.
     _, _, axes = np.linalg.svd(line - middle, full_matrices=False)
     distances = (points - middle) @ axes[-1]
     return float(np.median(np.abs(distances)))
@@ -336,14 +346,14 @@ class BallTrack:
 def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     """Track the ball that moves in front of a fixed camera.
 
-    The steps are: find cuts, estimate the background, detect round objects in each frame, link
-    them to paths, and choose the path of the ball.
+    The steps are: find cuts and keep the longest part without one, estimate the background, detect
+    round objects in each frame, link them to paths, and choose the path of the ball.
 
     Args:
         frames: Time in seconds and picture (height, width, 3) of each frame; iterated three times.
 
     Raises:
-        InputError: No ball is found.
+        InputError: No ball is found, or the part without a cut is too short.
     """
     frames = _FrameCache(frames)
     survey = film_cuts.survey_frames(frames)
@@ -352,8 +362,8 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     sample_frames = [
         first_frame + k for k in background_model.select_frames(survey.moved[first_frame:end_frame])
     ]
-    wanted_frames = set(sample_frames)
-    pictures = [picture for number, (_, picture) in enumerate(frames) if number in wanted_frames]
+    sample_set = set(sample_frames)
+    pictures = [picture for number, (_, picture) in enumerate(frames) if number in sample_set]
     detector = _make_detector(pictures)
     detections = []
     for number, (_, picture) in enumerate(frames):
@@ -365,11 +375,15 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
             _format_no_ball_message(end_frame - first_frame, sum(map(bool, detections)))
         )
     path, other_paths = merge_continuations(paths)
-    # An object that hardly moves may be a ball, but its fall cannot be measured.
+    # The fall of an object that hardly moves, or is seen in few frames, cannot be measured.
     if len(path.frames) < film_cuts.MIN_FRAMES or path.travel < path.radius:
         raise InputError(_format_no_ball_message(end_frame - first_frame, len(path.frames)))
     _note_other_objects(path, other_paths, notes)
-    sample_pictures = {n - first_frame: p for n, p in zip(sample_frames, pictures, strict=True)}
+    # Numbers of the frames count from the first frame of the part that is tracked.
+    sample_pictures = {
+        number - first_frame: picture
+        for number, picture in zip(sample_frames, pictures, strict=True)
+    }
     return _make_track(
         survey.times[first_frame:end_frame], path, survey.size, notes, detector, sample_pictures
     )
@@ -412,11 +426,9 @@ def _format_no_ball_message(frames: int, frames_with_objects: int) -> str:
         frames: Number of frames.
         frames_with_objects: Number of frames with a round object.
     """
-    observation = (
-        f"something round in {frames_with_objects} of {frames} frames, but nothing"
-        if frames_with_objects
-        else "nothing"
-    )
+    observation = "nothing"
+    if frames_with_objects:
+        observation = f"something round in {frames_with_objects} of {frames} frames, but nothing"
     return (
         f"no ball found: {observation} that moves and stays round; "
         "film with a fixed camera and a ball unlike its background"
@@ -424,12 +436,17 @@ def _format_no_ball_message(frames: int, frames_with_objects: int) -> str:
 
 
 def _make_detector(pictures: list[RgbImage]) -> BallDetector:
-    """Make a detector from a background without the ball, estimated from some pictures.
+    """Make a detector of balls, with a background estimated from some pictures.
 
-    It treats shadows in the way with which more round objects are found: as shadow, or as part
-    of the ball.
+    The background is first the median of the pictures. Twice, the objects are detected with it, and
+    it is estimated again without the pixels that they hide. The detector removes shadows if about
+    as many round objects are found with that as without.
+
+    Args:
+        pictures: Some pictures (height, width, 3) of the film.
     """
     background = background_model.compute_median_background(pictures)
+    # Both treatments of shadows are compared on some of the pictures.
     stride = max(1, len(pictures) // _COMPARED_FRAMES)
     # Two passes: objects hidden by the first background are detected with the second.
     for _ in range(2):
@@ -439,9 +456,8 @@ def _make_detector(pictures: list[RgbImage]) -> BallDetector:
         shadow_detections = [shadow_detector.detect(p, ghosts=True) for p in pictures[::stride]]
         plain_detections = [plain_detector.detect(p, ghosts=True) for p in pictures[::stride]]
         # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
-        if _compute_roundness(shadow_detections) >= _MIN_SHADOW_REMOVAL_RATIO * _compute_roundness(
-            plain_detections
-        ):
+        min_roundness = _MIN_SHADOW_REMOVAL_RATIO * _compute_roundness(plain_detections)
+        if _compute_roundness(shadow_detections) >= min_roundness:
             detector, known_detections = shadow_detector, shadow_detections
         else:
             detector, known_detections = plain_detector, plain_detections
@@ -451,26 +467,28 @@ def _make_detector(pictures: list[RgbImage]) -> BallDetector:
                 detections.append(known_detections[i // stride])
             else:
                 detections.append(detector.detect(picture, ghosts=True))
-        hiding = _list_hiding_circles(detections)
+        hiding_circles = _list_hiding_circles(detections)
         shadow_masks = None
         if detector.shadows:
-            # Pictures where the shadow in the background is missing; it hides it in the others.
+            # If a shadow of the background is missing in some pictures, these show the true
+            # background; the shadow hides it in the others.
             is_lit = np.stack([detector.find_missing_shadow(picture) for picture in pictures])
             shadow_masks = ~is_lit & (is_lit.sum(axis=0) >= _MIN_EMPTY_FRAMES)
         background = background_model.compute_masked_background(
-            pictures, hiding, background, shadow_masks
+            pictures, hiding_circles, background, shadow_masks
         )
     return BallDetector(background, sigma, detector.shadows)
 
 
 def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
-    """Return the sum over frames of the best circle's fraction of agreeing rays.
+    """Return how round the detected objects are: the sum over pictures of the best ray agreement.
 
-    It decides between background models: with the better one, outlines of the ball are rounder.
+    The ray agreement of a detection is the fraction of rays from its centre that meet the edge on
+    a circle.
 
     Args:
-        pictures: Detections in each frame; ghosts (traces of the ball in the background) do not
-            count.
+        pictures: Detections in each picture; ghosts (objects in the background image that the
+            picture lacks) do not count.
     """
     return sum(
         max(
@@ -482,41 +500,50 @@ def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
 
 
 def _list_hiding_circles(detections: list[list[BallDetection]]) -> list[list[Circle]]:
-    """Return the circles that hide the background in each picture.
+    """Return the circles that hide the true background in each picture.
 
-    A ball that rests for most of the film, or its shadow, is part of the median. Pictures without
-    it at that position show the true background; in the others it hides the background.
+    They are the detected objects, and objects in the present estimate of the background: a ball
+    that rests for most of the film, or its shadow, is part of the median. In pictures without it,
+    it is detected as a ghost; these show the true background, and all others are hidden there.
+
+    Args:
+        detections: Detections in each picture, including ghosts.
     """
-    balls: list[list[Circle]] = []
+    hiding_circles: list[list[Circle]] = []
     ghosts: list[list[Circle]] = []
     for picture_detections in detections:
-        balls.append([(s.u, s.v, s.radius) for s in picture_detections if not s.is_ghost])
-        ghosts.append([(s.u, s.v, s.radius) for s in picture_detections if s.is_ghost])
-    for ghost_circle in [ghost for circles in ghosts for ghost in circles]:
-        missing_flags = [
-            any(_is_same_object(ghost_circle, circle) for circle in circles) for circles in ghosts
+        hiding_circles.append([(d.u, d.v, d.radius) for d in picture_detections if not d.is_ghost])
+        ghosts.append([(d.u, d.v, d.radius) for d in picture_detections if d.is_ghost])
+    for ghost in [circle for circles in ghosts for circle in circles]:
+        # Whether the object is missing in each picture.
+        are_without_object = [
+            any(_is_same_object(ghost, circle) for circle in circles) for circles in ghosts
         ]
-        # One or two frames may miss it by mistake.
-        if sum(missing_flags) < _MIN_EMPTY_FRAMES:
+        # In one or two pictures it may be missed by mistake.
+        if sum(are_without_object) < _MIN_EMPTY_FRAMES:
             continue
-        for circles, is_missing in zip(balls, missing_flags, strict=True):
-            if not is_missing:
-                circles.append(ghost_circle)
-    return balls
+        for circles, is_without_object in zip(hiding_circles, are_without_object, strict=True):
+            if not is_without_object:
+                circles.append(ghost)
+    return hiding_circles
 
 
 def _is_same_object(a: Circle, b: Circle) -> bool:
     """Return whether two circles are the same object at rest.
 
-    Their centres may differ by `_SAME_CENTRE_SHARE` of the radius and half a pixel.
+    The distance of their centres (sum of both coordinates) may be `_SAME_CENTRE_SHARE` of the
+    radius and half a pixel, and their radii may differ by `_SAME_RADIUS_RATIOS`.
 
     Args:
         a: centre and radius of one circle, pixels.
         b: centre and radius of the other one.
     """
-    distance = abs(a[0] - b[0]) + abs(a[1] - b[1])
-    smallest, largest = _SAME_RADIUS_RATIOS
-    return distance < _SAME_CENTRE_SHARE * b[2] + 0.5 and smallest < a[2] / b[2] < largest
+    u, v, radius = a
+    other_u, other_v, other_radius = b
+    distance = abs(u - other_u) + abs(v - other_v)
+    min_ratio, max_ratio = _SAME_RADIUS_RATIOS
+    is_near = distance < _SAME_CENTRE_SHARE * other_radius + 0.5
+    return is_near and min_ratio < radius / other_radius < max_ratio
 
 
 def _note_other_objects(
@@ -553,26 +580,29 @@ def _make_track(
     path: TrackedPath,
     size: tuple[int, int],
     notes: list[str],
-    finder: BallDetector,
+    detector: BallDetector,
     pictures: dict[int, RgbImage],
 ) -> BallTrack:
-    """Make the track of a path, with noise estimate and notes.
+    """Make the track of the ball from its path, with noise estimate and notes.
+
+    Centres are refitted with smoothed radii. Frames in which another object was measured have no
+    position, since that is better than a wrong one.
 
     Args:
         times: (n,) times of the frames, s.
         path: Path of the ball.
         size: Width and height of the picture, pixels.
-        notes: Remarks so far.
-        finder: Detector, which has the background.
+        notes: Remarks so far, extended in place.
+        detector: Detector, which has the background.
         pictures: Some of the frames, by number.
     """
-    columns = np.full((3, len(times)), np.nan)
-    steady, misfits = _refine_with_smooth_radius(path.detections)
-    for frame, detection, misfit in zip(path.frames, steady, misfits, strict=True):
-        # An empty cell is better than the position of another object.
-        if not misfit:
-            columns[:, frame] = detection.u, detection.v, detection.radius
-    u, v, radius = columns
+    u, v, radius = np.full((3, len(times)), np.nan)
+    refined_detections, are_misfits = _refine_with_smooth_radius(path.detections)
+    for frame, detection, is_misfit in zip(
+        path.frames, refined_detections, are_misfits, strict=True
+    ):
+        if not is_misfit:
+            u[frame], v[frame], radius[frame] = detection.u, detection.v, detection.radius
     missing_count = int(np.isnan(u).sum())
     if missing_count:
         notes.append(
@@ -592,7 +622,7 @@ def _make_track(
         noise,
         size,
         tuple(notes),
-        finder.background,
+        detector.background,
         pictures,
     )
 
@@ -601,6 +631,9 @@ def _refine_with_smooth_radius(
     detections: list[BallDetection],
 ) -> tuple[list[BallDetection], list[bool]]:
     """Refit the centres with radii that change linearly along the path, as perspective implies.
+
+    The linear trend of the radius is fitted by reweighted least squares. Few detections are
+    returned unchanged.
 
     Returns:
         The refitted detections, and whether the radius of each deviates too much from the linear
@@ -611,8 +644,8 @@ def _refine_with_smooth_radius(
     centres = np.array([(detection.u, detection.v) for detection in detections])
     offsets = centres - centres.mean(axis=0)
     spread = np.maximum(np.ptp(centres, axis=0), 1.0)
-    # position along the path's main direction, about -1 to 1
-    axes = np.linalg.svd(offsets, full_matrices=False)[2]
+    # Position along the path's main direction, about -1 to 1.
+    _, _, axes = np.linalg.svd(offsets, full_matrices=False)
     path_position = offsets @ axes[0] / spread.max()
     basis = np.stack([np.ones_like(path_position), path_position], axis=1)
     radius = np.array([s.radius for s in detections])
@@ -635,14 +668,14 @@ def _refine_with_smooth_radius(
 def estimate_roughness(values: Array) -> float:
     """Estimate the noise of a signal from the residuals of local cubic fits.
 
-    A cubic is fitted to each window of nine samples in which the signal moves. Windows with gaps
-    are skipped, and the median makes the result insensitive to bounces.
+    A cubic is fitted to each window of `_NOISE_WINDOW_SAMPLES` samples in which the signal moves.
+    Windows with gaps are skipped, and the median makes the result insensitive to bounces.
 
     Args:
         values: (T,) signal, NaN where missing.
 
     Returns:
-        Standard deviation of the noise; NaN if the signal never moves.
+        Standard deviation of the noise; NaN if the signal is too short or never moves.
     """
     if len(values) < _NOISE_WINDOW_SAMPLES:
         return float("nan")

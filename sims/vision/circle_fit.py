@@ -51,11 +51,10 @@ _INLIER_SHARE = 0.1
 def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -> CircleFit | None:
     """Fit a circle to most of the points by Gauss-Newton with Tukey's weights.
 
-    With the distance d of a point from the centre, the residual is d - R (1). Each iteration solves
-    residual = n . (du, dv) + dR, with the direction n from the centre to the point, by weighted
-    least squares (2), with Tukey's weights (1 - (residual / width)^2)^2, zero beyond the width (3).
-    The normal equations are solved explicitly, because the call of numpy's solver would take most
-    of the time.
+    1. With the distance d of a point from the centre (u, v), the residual is d - R.
+    2. Each iteration solves residual = n . (du, dv) + dR by weighted least squares, with the
+       direction n from the centre to the point.
+    3. The weights are Tukey's, (1 - (residual / width)^2)^2 and zero beyond the width.
 
     Args:
         points: Points (n, 2), pixels.
@@ -63,7 +62,8 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
             used. None if there is no initial circle.
 
     Returns:
-        The circle and the distances of all points; None if no circle is found.
+        The circle, and the distance of each point from it (n,), positive outside; None if no
+        circle is found.
     """
     if start is None:
         return None
@@ -84,7 +84,7 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
             _SIGMA_PER_MEDIAN * compute_median(np.abs(residuals)), _MIN_EDGE_NOISE
         )
         weights = np.maximum(1 - (residuals / width) ** 2, 0.0) ** 2  # (3)
-        np.maximum(distances, 1e-9, out=distances)
+        np.maximum(distances, 1e-9, out=distances)  # the direction n divides by them
         design[0] = away_u / distances
         design[1] = away_v / distances
         design[3] = residuals
@@ -103,28 +103,34 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
 
 
 def _solve_gauss_newton_step(normal: Array) -> tuple[float, float, float] | None:
-    """Solve the Gauss-Newton equations (2) for (du, dv, dR); None if they are singular.
+    """Solve the normal equations of a Gauss-Newton step for (du, dv, dR).
 
-    `normal` (4, 4) holds the weighted sums of products of the rows (n_u, n_v, 1, rest).
+    The equations are those of weighted least squares for residual = n_u du + n_v dv + dR (2), with
+    the unit vector (n_u, n_v) from the centre to each point. They are solved explicitly, because a
+    call of NumPy's solver would take longer than all the rest.
 
-    The equations are residual = n . (du, dv) + dR, weighted (2), with the unit vector n from the
-    centre to each point.
+    Args:
+        normal: (4, 4) weighted sums of products of the rows n_u, n_v, 1 and residual.
+
+    Returns:
+        The step in pixels; None if the equations are singular.
     """
-    (xx, xy, mx, p), (_, yy, my, q), (_, _, total, r), _ = normal.tolist()
+    (uu, uv, u1, ur), (_, vv, v1, vr), (_, _, total, r1), _ = normal.tolist()
     if total <= 0:
         return None
-    # Eliminate dR by the Schur complement; two equations in du and dv remain.
-    a = xx - mx * mx / total
-    b = xy - mx * my / total
-    c = yy - my * my / total
+    # Eliminate dR by the Schur complement; two equations in du and dv remain, with the matrix
+    # (a b; b c) and the right-hand side (p, q). They are solved by Cramer's rule.
+    a = uu - u1 * u1 / total
+    b = uv - u1 * v1 / total
+    c = vv - v1 * v1 / total
     determinant = a * c - b * b
     if total * determinant < _MIN_DETERMINANT:
         return None
-    p = p - mx * r / total
-    q = q - my * r / total
+    p = ur - u1 * r1 / total
+    q = vr - v1 * r1 / total
     du = (c * p - b * q) / determinant
     dv = (a * q - b * p) / determinant
-    dr = (r - mx * du - my * dv) / total
+    dr = (r1 - u1 * du - v1 * dv) / total
     return du, dv, dr
 
 
@@ -137,7 +143,7 @@ def find_inliers(fitted: CircleFit) -> NDArray[np.bool_]:
 
 
 def select_better_fit(first: CircleFit | None, second: CircleFit | None) -> CircleFit | None:
-    """Return the circle that has more of the points on it.
+    """Return the circle that has more of the points on it; of equal ones, the first.
 
     Args:
         first: First circle, or None.
@@ -154,12 +160,10 @@ def select_better_fit(first: CircleFit | None, second: CircleFit | None) -> Circ
 def fit_arc(points: Array) -> Circle | None:
     """Fit circles to arcs of consecutive points, and return the one with most points on it.
 
-    A shadow or another ball disturbs one side of an edge. Circles are fitted to arcs of half of the
-    points that begin all around, by linear least squares (I. Kasa, IEEE Trans. Instrum. Meas. 25,
-    8, 1976, doi:10.1109/TIM.1976.6312298).
-
-    Kasa's linear fit solves x^2 + y^2 = 2 u x + 2 v y + (R^2 - u^2 - v^2) (4) for 2 u, 2 v and the
-    constant.
+    A shadow or another ball disturbs one side of an edge. So circles are fitted to arcs of half of
+    the points that begin at every third point all around. Kasa's linear least squares solve
+    x^2 + y^2 = 2 u x + 2 v y + (R^2 - u^2 - v^2) (4) for 2 u, 2 v and the constant (I. Kasa, IEEE
+    Trans. Instrum. Meas. 25, 8, 1976, doi:10.1109/TIM.1976.6312298).
 
     Args:
         points: Points (n, 2), in their order along the edge, pixels.
@@ -168,12 +172,14 @@ def fit_arc(points: Array) -> Circle | None:
         The circle; None if an arc does not determine one.
     """
     count = len(points)
+    # (arcs, points of an arc) indices; the edge is closed.
     arc_starts = np.arange(0, count, _ARC_STRIDE)
     arc_offsets = np.arange(count // 2 + 1)
     point_indices = (arc_starts[:, None] + arc_offsets) % count
     # Relative to the mean, because the squares in (4) lose digits far from the origin.
     mean = points.mean(axis=0)
     arcs = points[point_indices] - mean
+    # (arcs, points of an arc, 3): x, y and 1.
     design_matrix = np.concatenate([arcs, np.ones((*point_indices.shape, 1))], axis=2)
     transposed = design_matrix.transpose(0, 2, 1)
     normal = transposed @ design_matrix
@@ -185,6 +191,7 @@ def fit_arc(points: Array) -> Circle | None:
     u = doubled_u / 2
     v = doubled_v / 2
     radius = np.sqrt(np.maximum(constant + u**2 + v**2, 0.0))
+    # (arcs, n) distance of every point from every circle.
     x, y = (points - mean).T
     distances = np.hypot(x - u[:, None], y - v[:, None])
     deviations = distances - radius[:, None]

@@ -45,7 +45,9 @@ class FrameSurvey:
 
 
 def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
-    """Measure the change between consecutive frames at low resolution.
+    """Measure the motion in each frame of a film, and find its cuts, at low resolution.
+
+    Both follow from the change of the pixels from frame to frame. At a cut, most pixels change.
 
     Args:
         frames: Time in seconds and picture (height, width, 3) of each frame.
@@ -59,15 +61,15 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
     frame_size = 0, 0
     previous_frame = None
     for frame_index, (time, picture) in enumerate(frames):
-        if frame_index and picture.shape[1::-1] != frame_size:
+        height, width, _ = picture.shape
+        if frame_index and (width, height) != frame_size:
             expected = f"{frame_size[0]} x {frame_size[1]} px as before"
             raise InputError(f"frame {frame_index}: expected {expected}, found another size")
-        height, width = picture.shape[:2]
         frame_size = width, height
-        downsampling = height * width / _SURVEY_PIXELS
-        pixel_stride = max(1, int(downsampling**0.5))
+        pixel_stride = max(1, int((height * width / _SURVEY_PIXELS) ** 0.5))
         thinned = picture[::pixel_stride, ::pixel_stride].astype(np.int16)
         reference_frame = thinned if previous_frame is None else previous_frame
+        # Largest change of the three colours of each pixel.
         change = np.abs(thinned - reference_frame).max(axis=2)
         if np.mean(change > _MIN_PIXEL_CHANGE) > _MIN_CUT_SHARE:
             cuts.append(frame_index)
@@ -88,6 +90,8 @@ MIN_FRAMES = 5
 
 def find_longest_shot(survey: FrameSurvey, notes: list[str]) -> tuple[int, int]:
     """Return the first frame and the end (exclusive) of the longest part without a cut.
+
+    If the film has cuts, a note says which part is used.
 
     Args:
         survey: result of the first pass over the frames.

@@ -106,32 +106,33 @@ class FilmedBall(Simulator):
         self.parameters = self._ball.parameters
 
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
-        """Simulate the film of each parameter vector; see `Simulator.simulate`.
+        """Simulate a film of the ball for each parameter vector; see `Simulator.simulate`.
 
         Args:
             theta: (n, 1) parameters.
             scenario: times, initial state and constants of the run.
 
         Returns:
-            Pixel rows (n, T, C).
+            (n, T, C) observed channels: the height z in m, NaN if films are tracked, and the pixel
+            row v of the ball, NaN where it is not seen.
         """
         constants = self.run_constants(scenario)
-        self.run_inputs(scenario)  # which refuses any: the ball does not know of these names
+        self.run_inputs(scenario)  # raises an error if the scenario has inputs
         fall = Scenario(
             scenario.times, scenario.initial, {}, self._select_ball_constants(constants)
         )
-        places = self._ball.simulate(theta, fall)
+        centres = self._ball.simulate(theta, fall)  # (n, T, 3), m
         camera = _make_camera(constants)
         radius = constants["radius"]
         if self._tracked:
             tracks = [
-                _track_film(camera, radius, positions, scenario.times) for positions in places
+                _track_film(camera, radius, positions, scenario.times) for positions in centres
             ]
-            rows = np.array(tracks).reshape(places.shape[:2])  # also for an empty batch
+            rows = np.array(tracks).reshape(centres.shape[:2])  # also for an empty batch
             heights = np.full_like(rows, np.nan)
         else:
-            outline_centres, _ = camera.project_sphere(places, radius)
-            heights = places[..., 2]
+            outline_centres, _ = camera.project_sphere(centres, radius)
+            heights = centres[..., 2]
             rows = outline_centres[..., 1]
         observations = np.stack([heights, rows], axis=2)
         result: Array = observations[:, :, self.columns]
@@ -153,15 +154,16 @@ def _make_camera(constants: Mapping[str, float]) -> PinholeCamera:
     return PinholeCamera(*place, target=(0.0, 0.0, constants["camera_aim"]), size=(size, size))
 
 
-def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Array) -> Array:
-    """Return the pixel rows (T,) that the tracker finds in a film of a ball.
+def _track_film(camera: PinholeCamera, radius: float, centres: Array, times: Array) -> Array:
+    """Render a film of a ball, and return the pixel rows (T,) that the tracker finds in it.
 
-    NaN stands where it finds none.
+    A row is NaN in frames in which the tracker finds no ball, and all are if the motion is not
+    finite.
 
     Args:
-        camera: camera: its position, axes, focal length and principal point.
+        camera: camera that films the ball.
         radius: radius of the ball, m.
-        places: (T, 3) centre of the ball, m.
+        centres: (T, 3) centre of the ball, m.
         times: (T,) times of the frames, s.
     """
     from sims.vision.ball_renderer import BallScene, SceneAppearance
@@ -169,7 +171,7 @@ def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Arra
     from sims.vision.video_files import VideoFile, write_video
 
     pixel_rows: Array = np.full(times.size, np.nan)
-    if not np.isfinite(places).all():
+    if not np.isfinite(centres).all():
         return pixel_rows
     # Light, colours and compression are drawn from what the film shows: the same parameters and
     # scenario give the same film, whatever was filmed before.
@@ -179,22 +181,22 @@ def _track_film(camera: PinholeCamera, radius: float, places: Array, times: Arra
         camera.height,
         *camera.size,
         radius,
-        *places.ravel(),
+        *centres.ravel(),
     ]
     digest = hashlib.sha256(np.array(film_settings).tobytes()).digest()
     rng = np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
     appearance = SceneAppearance.draw(rng)
-    stage = BallScene(camera, appearance, radius, rng)
+    scene = BallScene(camera, appearance, radius, rng)
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
-            write_video(path, stage.render_frames(places), times, appearance.crf)
-            measured = track_ball(VideoFile(path))
-    except InputError:  # no ball to be seen: nothing was measured
+            write_video(path, scene.render_frames(centres), times, appearance.crf)
+            track = track_ball(VideoFile(path))
+    except InputError:  # no ball is found
         return pixel_rows
     finally:
-        stage.close()
-    # Frames without a ball are left out of a track: each place is found by its time.
-    frames = np.interp(measured.times, times - times[0], np.arange(times.size))
-    pixel_rows[np.rint(frames).astype(int)] = measured.v
+        scene.close()
+    # A track may lack frames, so the number of each frame is found by its time.
+    frames = np.interp(track.times, times - times[0], np.arange(times.size))
+    pixel_rows[np.rint(frames).astype(int)] = track.v
     return pixel_rows

@@ -1,7 +1,7 @@
-"""Pinhole camera with lens distortion, and its file.
+"""Pinhole camera without lens distortion, and its file.
 
 Pixels are (u, v): u to the right, v down, (0, 0) the centre of the upper left pixel, as in OpenCV.
-World coordinates are in metres, z up. Pixels are square and the lens has no distortion.
+World coordinates are in metres, z up. Pixels are square.
 
 With (X, Y, Z) a point in the camera's frame (right, down, depth), f the focal length in pixels and
 (u0, v0) the pixel of the optical axis (the principal point):
@@ -99,12 +99,12 @@ class PinholeCamera:
     def draw_published(cls, rng: np.random.Generator, pixels: int = 100) -> PinholeCamera:
         """Draw a camera as for the published visual tuner.
 
-        Azimuth U[0, 2 pi], distance U[5, 10] m, height U[5, 8] m, aimed at (0, 0, 2), field of view
-        40 degrees, 100 x 100 px (Allevato et al., TuneNet, arXiv 1907.11200, released code).
+        Azimuth U[0, 2 pi] rad, distance U[5, 10] m, height U[5, 8] m, aimed at (0, 0, 2) m, field
+        of view 40 degrees (Allevato et al., TuneNet, arXiv 1907.11200, released code).
 
         Args:
             rng: Random number generator.
-            pixels: Width and height of the picture.
+            pixels: Width and height of the picture; 100 in the publication.
         """
         low = 0.0, 5.0, 5.0
         high = 2 * math.pi, 10.0, 8.0
@@ -150,12 +150,11 @@ class PinholeCamera:
         return result
 
     def project(self, points: ArrayLike) -> Array:
-        """Project world points (..., 3) to pixels (..., 2).
+        """Project world points (..., 3) in m to pixels (..., 2).
 
-        Pixels may be outside the picture; they are NaN for points behind the camera.
-
-        With the point (X, Y, Z) in the camera's frame, u = u0 + f X / Z and v = v0 + f Y / Z (2),
-        with the focal length f and the principal point (u0, v0) in pixels.
+        With the point (X, Y, Z) in the camera's frame (right, down, depth), the focal length f and
+        the principal point (u0, v0) in pixels, u = u0 + f X / Z and v = v0 + f Y / Z (2). Pixels
+        may be outside the picture; they are NaN for points behind the camera.
         """
         camera_points = self.to_camera_frame(points)
         depth = camera_points[..., 2:]
@@ -167,13 +166,14 @@ class PinholeCamera:
     def project_sphere(self, points: ArrayLike, radius: float) -> tuple[Array, Array]:
         """Return the ellipse that is the outline of a sphere in the picture.
 
-        The longer axis points to the middle of the picture, and the centre is slightly further from
-        it than the projection of the sphere's own centre.
-
         A sphere of radius r at distance d, at the angle t from the optical axis, fills a cone of
-        half angle p with sin p = r / d (4). Its picture is an ellipse with the centre a = (tan(t -
-        p) + tan(t + p)) / 2 and the half length (tan(t + p) - tan(t - p)) / 2 (5); its half width b
-        follows from (a sin t + cos t)^2 = cos(p)^2 (a^2 + b^2 + 1) (6).
+        half angle p with sin p = r / d (4). Its picture is an ellipse, whose longer axis points to
+        the middle of the picture. At unit focal length,
+
+        * its centre is at the distance a = (tan(t - p) + tan(t + p)) / 2 from the middle (5), which
+          is slightly further than the projection of the sphere's own centre
+        * its half length is (tan(t + p) - tan(t - p)) / 2 (5)
+        * its half width b follows from (a sin t + cos t)^2 = cos(p)^2 (a^2 + b^2 + 1) (6)
 
         Args:
             points: Centres of the sphere (..., 3), m.
@@ -184,25 +184,25 @@ class PinholeCamera:
             NaN where the sphere is not wholly in front of the camera.
         """
         camera_points = self.to_camera_frame(points)
-        sideways = camera_points[..., :2]
+        sideways = camera_points[..., :2]  # right and down, m
         depth = camera_points[..., 2]
         distances = np.linalg.norm(camera_points, axis=-1)
         lateral_distance = np.hypot(sideways[..., 0], sideways[..., 1])
         with np.errstate(invalid="ignore", divide="ignore"):
-            half_angle = np.arcsin(radius / distances)  # (4)
-            tilt = np.arctan2(lateral_distance, depth)
+            half_angle = np.arcsin(radius / distances)  # p of (4)
+            tilt = np.arctan2(lateral_distance, depth)  # t
             # The section is no ellipse if the cone reaches the plane of the camera.
             tilt = np.where(tilt + half_angle < math.pi / 2, tilt, np.nan)
             near_end = np.tan(tilt - half_angle)
             far_end = np.tan(tilt + half_angle)
-            centre_radius = (near_end + far_end) / 2  # (5)
-            lean = centre_radius * np.sin(tilt) + np.cos(tilt)
-            ratio = lean / np.cos(half_angle)
-            squared_semi_axis = ratio**2 - centre_radius**2 - 1  # (6), b^2
+            centre_distance = (near_end + far_end) / 2  # a of (5)
+            axis_component = centre_distance * np.sin(tilt) + np.cos(tilt)
+            ratio = axis_component / np.cos(half_angle)
+            squared_semi_axis = ratio**2 - centre_distance**2 - 1  # b^2 of (6)
             # In the middle of the picture the direction is arbitrary.
             divisor = np.where(lateral_distance > 0, lateral_distance, 1.0)
             direction = sideways / divisor[..., None]
-        centre = self.principal_point + self.focal * centre_radius[..., None] * direction
+        centre = self.principal_point + self.focal * centre_distance[..., None] * direction
         semi_major_axis = (far_end - near_end) / 2  # (5)
         semi_minor_axis = np.sqrt(squared_semi_axis)
         return centre, self.focal * np.stack([semi_major_axis, semi_minor_axis], axis=-1)
@@ -210,20 +210,21 @@ class PinholeCamera:
     def estimate_heights(self, centres: ArrayLike, x: float, y: float, radius: float) -> Array:
         """Estimate the heights of a ball on a vertical line from the centres of its outlines.
 
-        In the camera frame, whose third axis Z is the depth, a point on that vertical line is
-        base + z up. The projection (2) says that its first two coordinates are k times its depth,
-        with the pixel coordinates k = (u - u0, v - v0) / f. So
+        In the camera frame (right X, down Y, depth Z), a point on that vertical line is
+        base + z up. The projection says that its first two coordinates are k times its depth, with
+        the pixel coordinates k = (u - u0, v - v0) / f, where f is the focal length and (u0, v0) the
+        principal point. So
 
             (7)  (base_XY - k base_Z) + z (up_XY - k up_Z) = 0
 
         These two equations are solved for z by least squares. The outline of a ball is not centred
-        at the projection of its centre; this small offset is computed from the height found, and
-        subtracted from the pixels, a few times.
+        at the projection of its centre. This small offset depends on the height; so it is computed
+        from the height found and subtracted from the pixels, in `_REFINEMENT_COUNT` iterations.
 
         Args:
             centres: Centres of the outlines (..., 2), pixels.
-            x: Horizontal position of the vertical line, m.
-            y: Horizontal position of the vertical line, m.
+            x: First horizontal coordinate of the vertical line, m.
+            y: Second horizontal coordinate of the vertical line, m.
             radius: Radius of the ball, m.
 
         Returns:
@@ -232,19 +233,18 @@ class PinholeCamera:
         pixels = np.asarray(centres, dtype=np.float64)
         base = self.to_camera_frame((x, y, 0.0))
         up = self.axes[:, 2]
-        shift: Array = np.zeros_like(pixels)
+        offset: Array = np.zeros_like(pixels)
         z: Array = np.full(pixels.shape[:-1], np.nan)
         for _ in range(_REFINEMENT_COUNT):
-            k = (pixels - shift - self.principal_point) / self.focal
+            k = (pixels - offset - self.principal_point) / self.focal
+            # Equations (7): constant + z slope = 0, for X and Y.
             constant = base[:2] - k * base[2]
             slope = up[:2] - k * up[2]
-            constant_product = (constant * slope).sum(axis=-1)
-            square = (slope * slope).sum(axis=-1)
-            z = -constant_product / square  # (7)
+            z = -(constant * slope).sum(axis=-1) / (slope * slope).sum(axis=-1)
             ones = np.ones_like(z)
             points = np.stack([x * ones, y * ones, z], axis=-1)
-            centre, _ = self.project_sphere(points, radius)
-            shift = centre - self.project(points)
+            outline_centres, _ = self.project_sphere(points, radius)
+            offset = outline_centres - self.project(points)
         return z
 
 
@@ -316,7 +316,10 @@ def _read_section(
         path: path of the camera file, for messages.
         section: name of the section.
         meta: content of the file.
-        counts: number of values of each entry.
+        counts: number of values of each entry; 1 stands for a number, which is not in a list.
+
+    Raises:
+        InputError: an entry is missing, unknown, or has another number of values.
     """
     table = check_table(path, section, meta.get(section))
     check_known_names(f"entry in [{section}] of {path}", table, counts)
@@ -326,6 +329,6 @@ def _read_section(
         if count == 1:
             values[name] = check_finite(path, key, value)
         else:
-            row = check_number_list(path, key, value, count)
-            values[name] = tuple(check_finite(path, key, entry) for entry in row)
+            numbers = check_number_list(path, key, value, count)
+            values[name] = tuple(check_finite(path, key, number) for number in numbers)
     return values

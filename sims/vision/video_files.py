@@ -39,10 +39,10 @@ def check_installed(instead: str = "") -> None:
 
 @cache
 def import_package(name: str) -> Any:
-    """Import one of the packages for films.
+    """Import one of the packages for films, whose import takes time and is optional.
 
     Raises:
-        InputError: The package is missing.
+        InputError: The package is missing; the message says how to install it.
     """
     try:
         return importlib.import_module(name)
@@ -97,16 +97,20 @@ def write_video(
 
 
 def _encode_frames(path: Path, frames: Iterable[RgbImage], times: Array, crf: int) -> None:
-    """Encode frames as H.264 with their own times; the same frames give the same file.
+    """Encode frames as H.264 with their own times, such that the same frames give the same file.
 
     Args:
         path: file to write.
         frames: pictures, all of the same size.
         times: (n,) times of the frames, s.
         crf: constant rate factor of x264: larger numbers mean smaller files and less quality.
+
+    Raises:
+        InputError: width or height of a frame is odd.
     """
     av = import_package("av")
     ticks = np.rint((times - times[0]) * _TICKS_PER_SECOND).astype(int)
+    # Mean frame rate, which the file states in addition to the times.
     rate = Fraction(30)
     if len(times) > 1:
         seconds = Fraction(max(1, int(ticks[-1])), _TICKS_PER_SECOND)
@@ -116,20 +120,19 @@ def _encode_frames(path: Path, frames: Iterable[RgbImage], times: Array, crf: in
         stream = file.add_stream("libx264", rate=rate.limit_denominator(1000))
         stream.pix_fmt = "yuv420p"
         stream.thread_count = 1
-        # Reproducible output on every processor: with x264's fast code paths alone, the file
-        # differs occasionally.
-        exact_options = {"x264-params": "cpu-independent=1"}
         stream.options = {
             "crf": str(crf),
             "preset": "veryfast",
             # No B-frames, so that frames are stored in the order of their times.
             "bf": "0",
-            **exact_options,
+            # The same output on every processor: with x264's fast code paths alone, the file
+            # differs occasionally.
+            "x264-params": "cpu-independent=1",
         }
         stream.codec_context.time_base = Fraction(1, _TICKS_PER_SECOND)
         converter = av.video.reformatter.VideoReformatter()
         for tick, picture in zip(ticks.tolist(), frames, strict=True):
-            if not stream.codec_context.is_open:
+            if not stream.codec_context.is_open:  # the first frame
                 stream.height, stream.width = picture.shape[:2]
                 if stream.height % 2 or stream.width % 2:
                     raise InputError(
@@ -177,7 +180,11 @@ class VideoFile:
             pass
 
     def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
-        """Iterate over time in seconds and picture of each readable frame; times increase."""
+        """Iterate over time in seconds and picture of each readable frame.
+
+        Frames whose times do not increase are left out. After the last frame, `notes` describes the
+        faults of the file.
+        """
         self.notes = []
         last_time = -np.inf
         count = 0
@@ -200,7 +207,7 @@ class VideoFile:
         self._check_pass(count, stated_count, is_broken, dropped_count)
 
     def _open_file(self) -> Any:
-        """Open the file with PyAV.
+        """Open the file with PyAV, as a context manager.
 
         Raises:
             InputError: the file cannot be read, or contains no moving pictures.
@@ -223,8 +230,11 @@ class VideoFile:
     def _decode_frames(self, file: Any) -> Iterator[tuple[float, RgbImage | None]]:
         """Iterate over time in seconds and picture of each frame.
 
-        A frame without a stamp gets its time from the frame rate. After a decoding error the last
-        item has the picture None, so that the frames before it are not lost.
+        A frame without a stamp gets its time from the frame rate. A decoding error ends the frames
+        with an item whose picture is None; the frames before it are not lost.
+
+        Args:
+            file: file as opened by PyAV.
         """
         av = import_package("av")
         stream = file.streams.video[0]
@@ -244,13 +254,16 @@ class VideoFile:
     def _check_pass(
         self, count: int, stated_count: int, is_broken: bool, dropped_count: int
     ) -> None:
-        """Add notes about faults of a pass; refuse a file without readable frames.
+        """Add notes about the faults that were found while reading all frames.
 
         Args:
             count: Number of frames read.
             stated_count: Number of frames that the file states; 0 if unknown.
             is_broken: Whether decoding failed.
             dropped_count: Number of frames whose times do not increase.
+
+        Raises:
+            InputError: No frame could be read.
         """
         if not count:
             raise InputError(
@@ -268,11 +281,13 @@ class VideoFile:
 
 
 def _apply_rotation(frame: Any, degrees: float) -> RgbImage:
-    """Rotate the picture as a viewer does: telephones store how they were held.
+    """Return the picture of a frame, rotated as the file states.
+
+    Telephones store how they were held instead of rotating the picture.
 
     Args:
         frame: frame of PyAV.
-        degrees: rotation that the file states.
+        degrees: rotation that the file states, anticlockwise, a multiple of 90.
     """
     picture: RgbImage = frame.to_ndarray()
     turns = round(degrees / 90) % 4
