@@ -46,7 +46,10 @@ DEFAULT_HEIGHT = 1.5
 def film_and_track_drop(
     path: Path, heights: Array, times: Array, radius: float, pixels: int, rng: np.random.Generator
 ) -> None:
-    """Film a drop, and write the tracked recording with description, film and camera.
+    """Film a drop with a random camera, track the film, and write the tracked recording.
+
+    The film, its camera and a figure of the track are written next to the recording. Files of an
+    interrupted call are replaced.
 
     Args:
         path: CSV file of the recording.
@@ -59,16 +62,14 @@ def film_and_track_drop(
     Raises:
         InputError: the packages for films are missing, or the ball cannot be found in the film.
     """
-    azimuth, distance, height = (
-        float(rng.uniform(*pair))
-        for pair in ((0.0, 2.0 * math.pi), CAMERA_DISTANCE_RANGE, CAMERA_HEIGHT_RANGE)
-    )
+    azimuth = float(rng.uniform(0.0, 2.0 * math.pi))
+    distance = float(rng.uniform(*CAMERA_DISTANCE_RANGE))
+    height = float(rng.uniform(*CAMERA_HEIGHT_RANGE))
     # The codec halves the resolution of colour, so both dimensions must be even.
     size = (2 * round(ASPECT_RATIO * pixels / 2), pixels)
-    camera, appearance = (
-        PinholeCamera(azimuth, distance, height, (0.0, 0.0, CAMERA_TARGET_HEIGHT), size=size),
-        SceneAppearance.draw(rng),
-    )
+    target = (0.0, 0.0, CAMERA_TARGET_HEIGHT)
+    camera = PinholeCamera(azimuth, distance, height, target, size=size)
+    appearance = SceneAppearance.draw(rng)
     film = path.with_suffix(".mp4")
     # Recordings and films are never overwritten, and a killed process may have left some of them.
     for leftover in (
@@ -97,6 +98,9 @@ RECORDINGS_FOLDER = "recordings"
 def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, path: Path) -> None:
     """Record a drop of the ball on level ground, unless the recording exists already.
 
+    The true world is simulated. The drop is filmed and tracked if the experiment has a film;
+    otherwise heights with noise are recorded.
+
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         setup: setup of the shot: its ball, drop, incline and hoop.
@@ -113,9 +117,9 @@ def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, 
     drop_height = float(rng.uniform(*height)) if isinstance(height, tuple) else height
     radius, sampling = setup.ball.radius, experiment.sampling
     times = np.arange(sampling.samples) / sampling.rate
-    heights = simulate_shot(
-        setup.ball, InclinedGround(0.0, settings.friction), (0.0, 0.0, radius + drop_height), times
-    )[:, 2]
+    ground = InclinedGround(0.0, settings.friction)
+    centres = simulate_shot(setup.ball, ground, (0.0, 0.0, radius + drop_height), times)
+    heights = centres[:, 2]
     if settings.filmed:
         film_and_track_drop(path, heights, times, radius, round(settings.filmed), rng)
         return

@@ -38,22 +38,22 @@ def build_result_table(rows: pd.DataFrame) -> pd.DataFrame:
 
     Distances are in m. `off` is the distance from the hoop's centre in the plane of the hoop; it is
     infinite for a shot that never meets the plane.
+
+    Args:
+        rows: rows of shots.csv, one per method and shot.
     """
     lines = []
-    for method, part in rows.groupby("method", sort=False):
-        balls = [(ball, group) for ball, group in part.groupby("ball", sort=False)]
-        lines += [
-            _compute_table_row(str(method), str(ball), group)
-            for ball, group in [*balls, (ALL_BALLS, part)]
-        ]
+    for method, rows_of_method in rows.groupby("method", sort=False):
+        groups = [*rows_of_method.groupby("ball", sort=False), (ALL_BALLS, rows_of_method)]
+        lines += [_compute_table_row(str(method), str(ball), group) for ball, group in groups]
     return pd.DataFrame(lines, columns=RESULT_COLUMNS)
 
 
 def _compute_table_row(method: str, ball: str, part: pd.DataFrame) -> list[object]:
     """Compute one line of the results table, in the order of `RESULT_COLUMNS`.
 
-    A shot that never meets the plane of the hoop counts as infinitely far off. Quantiles are
-    therefore not interpolated: they are the next higher value.
+    A shot that never meets the plane of the hoop counts as infinitely far off. The quantiles of the
+    distances are therefore not interpolated: they are the next higher value.
 
     Args:
         method: label of the method.
@@ -64,7 +64,6 @@ def _compute_table_row(method: str, ball: str, part: pd.DataFrame) -> list[objec
     miss_distances = part["off"].abs().fillna(math.inf)
     errors = part["prediction_error"]
     failures = int(part["status"].isin(NO_SHOT_STATUSES).sum())
-    # Not interpolated, because values may be infinite.
     miss_quantiles = miss_distances.quantile([0.5, 0.9], interpolation="higher").tolist()
     return [
         method,
@@ -83,18 +82,24 @@ def _compute_table_row(method: str, ball: str, part: pd.DataFrame) -> list[objec
 
 
 def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
-    """Make the panel of the hit rate of each method by ball, with its table.
+    """Make the panel of a chart that shows the hit rate of each method by ball.
 
     Args:
         lines: table of `build_result_table`.
+
+    Returns:
+        The panel, and its table: the lines with the position of their ball on the horizontal axis
+        as column ``place``.
     """
+    # All balls together come first.
     balls = [ALL_BALLS, *(ball for ball in dict.fromkeys(lines["ball"]) if ball != ALL_BALLS)]
     places = {ball: place for place, ball in enumerate(balls)}
     methods = dict.fromkeys(lines["method"])
-    styles = {method: get_mark_style(place) for place, method in enumerate(methods)}
+    styles = {method: get_mark_style(number) for number, method in enumerate(methods)}
     series = make_method_series(
         styles, "method", "rate", is_shifted=True, low="low", high="high", draw="points"
     )
+    # Methods may have different numbers of shots, if some are missing.
     counts = lines.groupby("ball")["shots"].agg(["min", "max"]).astype(int)
     names = []
     for ball in balls:

@@ -44,8 +44,15 @@ class FilmFrames(NamedTuple):
     tracks: list[Array]
 
 
-class _Moving(NamedTuple):
-    """Flown path (T, 3) until sample `end`, its line, and the ball at the end of the line."""
+class _ShotPanel(NamedTuple):
+    """Panel of a shot.
+
+    Attributes:
+        path: flown path x, y, z (T, 3), m.
+        end: number of its samples that are shown.
+        line: matplotlib line of the path flown so far.
+        ball: matplotlib marker of the ball at the end of the line.
+    """
 
     path: Array
     end: int
@@ -53,20 +60,20 @@ class _Moving(NamedTuple):
     ball: Any
 
     def show(self, sample: int) -> None:
-        """Draw the flown path up to a sample, with the ball at its end.
+        """Draw the flown path (x and z) up to a sample, with the ball at its end.
 
-        The ball stops at the last sample of the path.
+        The ball stops at the last sample that is shown.
 
         Args:
             sample: index of the sample.
         """
-        index = min(sample, self.end - 1)
-        self.line.set_data(self.path[: index + 1, 0], self.path[: index + 1, 2])
-        self.ball.set_data(self.path[index : index + 1, 0], self.path[index : index + 1, 2])
+        x, _, z = self.path[: min(sample + 1, self.end)].T
+        self.line.set_data(x, z)
+        self.ball.set_data(x[-1:], z[-1:])
 
 
-class _Filmed(NamedTuple):
-    """Panel of the film: frame, track so far, and a ring around its end."""
+class _FilmPanel(NamedTuple):
+    """Panel of the film: matplotlib image, line of the track so far, and a ring around its end."""
 
     picture: Any
     track: Any
@@ -110,7 +117,7 @@ def write_animation(
 
     setup, methods = example
     film = _read_film(folder / RECORDINGS_FOLDER / f"{setup.name}.mp4")
-    film_columns = int(bool(film.pictures))
+    film_columns = 1 if film.pictures else 0
     # Margins are set once, below: a layout engine would move the panels from frame to frame.
     figure, axes = make_panel_grid(
         1,
@@ -121,11 +128,14 @@ def write_animation(
         gridspec_kw={"width_ratios": [0.5] * film_columns + [1] * len(methods)},
     )
     shot = execute_example(settings, setup, methods, stored)
-    panels = zip(axes[0, film_columns:], methods, strict=True)
-    moving = [_draw_shot_panel(axis, setup, method, shot) for axis, method in panels]
-    filmed = _draw_film_panel(axes[0, 0], film) if film_columns else None
+    shot_panels = [
+        _draw_shot_panel(axis, setup, method, shot)
+        for axis, method in zip(axes[0, film_columns:], methods, strict=True)
+    ]
+    film_panel = _draw_film_panel(axes[0, 0], film) if film_columns else None
+    # Samples of a path per frame of the animation.
     step = SAMPLING_RATE_HZ / _FRAMES_PER_SECOND / _SLOW_MOTION_FACTOR
-    shots = int(np.ceil(max(panel.end for panel in moving) / step)) + 1
+    shot_frames = int(np.ceil(max(panel.end for panel in shot_panels) / step)) + 1
 
     def show(frame: int) -> list[Any]:
         """Draw one frame of the animation: first the film, then the shots in slow motion.
@@ -136,25 +146,25 @@ def write_animation(
         Returns:
             An empty list, which matplotlib expects if whole figures are drawn.
         """
-        later = frame - len(film.pictures)
-        if filmed is not None and later < 0:
-            filmed.show(film.pictures[frame], film.tracks[frame])
+        shot_frame = frame - len(film.pictures)
+        if film_panel is not None and shot_frame < 0:
+            film_panel.show(film.pictures[frame], film.tracks[frame])
         else:
-            for panel in moving:
-                panel.show(round(later * step))
+            for panel in shot_panels:
+                panel.show(round(shot_frame * step))
         return []
 
     if trusted:
         figure.suptitle(TRUSTED_TUNERS_NOTE, fontsize=7)
     figure.tight_layout()
     path = folder / "figures" / "shot.gif"
-    frames = len(film.pictures) + shots + _HOLD_FRAMES
+    frames = len(film.pictures) + shot_frames + _HOLD_FRAMES
     writer = PillowWriter(_FRAMES_PER_SECOND)
     FuncAnimation(figure, show, frames=frames).save(path, writer, dpi=_DPI)
     return path
 
 
-def _draw_shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot) -> _Moving:
+def _draw_shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot) -> _ShotPanel:
     """Draw the panel of one method in its initial state: the planned path, no flown path yet.
 
     Args:
@@ -164,14 +174,14 @@ def _draw_shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot
         shot: executed example: a shot with the path that it took.
     """
     draw_shot_panel(axis, setup, method, shot)
-    line = axis.lines[-1]
+    line = axis.lines[-1]  # the flown path
     line.set_data([], [])
     (ball,) = axis.plot([], [], marker="o", color=VERMILION, markeredgecolor="black", markersize=7)
     path = shot.results[method].flown
-    return _Moving(path, find_path_end(path, setup.scene), line, ball)
+    return _ShotPanel(path, find_path_end(path, setup.scene), line, ball)
 
 
-def _draw_film_panel(axis: Any, film: FilmFrames) -> _Filmed:
+def _draw_film_panel(axis: Any, film: FilmFrames) -> _FilmPanel:
     """Draw the panel of the film in its initial state: first frame, no track.
 
     The panel shows one frame of the film, with the tracked path of the ball so far.
@@ -189,7 +199,7 @@ def _draw_film_panel(axis: Any, film: FilmFrames) -> _Filmed:
     (ring,) = axis.plot([], [], "o", **marker_style)
     axis.set_title("one drop,\nfilmed and tracked", fontsize=9)
     axis.set(xticks=[], yticks=[])
-    return _Filmed(picture, track, ring)
+    return _FilmPanel(picture, track, ring)
 
 
 def _read_film(path: Path) -> FilmFrames:
@@ -206,11 +216,12 @@ def _read_film(path: Path) -> FilmFrames:
         run = read_recording(path.with_suffix(".csv"), Ball, whole=True).runs[0]
     except InputError:
         return FilmFrames([], [])
-    times = np.array([time for time, _ in frames]) - frames[0][0]
-    # 1e-6 s below is a tolerance for rounded times.
+    stamps, film_pictures = zip(*frames, strict=True)
+    times = np.array(stamps) - stamps[0]
+    # Times of the frames of the animation, s.
     frame_times = np.arange(0.0, times[-1], 1.0 / _FRAMES_PER_SECOND)
-    track = np.stack([run.extra["u"], run.extra["v"]], axis=1)
     pictures = [
-        frames[int(np.searchsorted(times, time - TIME_ROUNDING))][1] for time in frame_times
+        film_pictures[int(np.searchsorted(times, time - TIME_ROUNDING))] for time in frame_times
     ]
+    track = np.stack([run.extra["u"], run.extra["v"]], axis=1)  # (n, 2), pixels
     return FilmFrames(pictures, [track[run.times <= time + TIME_ROUNDING] for time in frame_times])

@@ -70,9 +70,10 @@ class BallKind:
     source: str
 
     def compute_restitution(self, speed: float) -> float:
-        """Return the restitution at an impact speed in m/s; at most 1.
+        """Return the coefficient of restitution at an impact speed in m/s; at most 1.
 
-        With the restitution e at the speed v of the rules' drop, e(u) = e (u / v)^p (2).
+        With the restitution e at the impact speed v for which it is known, and the exponent p, it
+        is e(u) = e (u / v)^p (2) at the speed u. Speeds below `_MIN_IMPACT_SPEED` count as that.
         """
         ratio = max(speed, _MIN_IMPACT_SPEED) / self.speed
         return min(1.0, self.restitution * float(ratio**self.exponent))  # (2)
@@ -233,7 +234,8 @@ def read_shot_config(experiment: Experiment) -> ShotConfig:
     """Read and validate the [shot] table of an experiment, with defaults.
 
     Raises:
-        InputError: an unknown entry, or a value of a wrong type.
+        InputError: an unknown entry, ball or tuner, a value of a wrong type or range, or pixel rows
+            without a film.
     """
     source, hints = f"experiment {experiment.name}", get_type_hints_of(ShotConfig)
     check_known_names(f"entry of [shot] in {source}", experiment.shot, hints)
@@ -255,7 +257,9 @@ def read_shot_config(experiment: Experiment) -> ShotConfig:
 
 
 def _convert_value(source: str, key: str, value: Any, declared: Any) -> Any:
-    """Convert a value to the type of its field; numbers must not be negative.
+    """Convert a value to the type of its field: names, a range, or a number.
+
+    Numbers must not be negative.
 
     Args:
         source: beginning of error messages.

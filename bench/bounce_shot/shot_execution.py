@@ -46,7 +46,11 @@ class ShotResult:
 
 
 def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> ShotResult:
-    """Execute a planned shot, with the shot's release error.
+    """Simulate the flight of a planned shot in the true world, with the shot's release error.
+
+    The ball is dropped on the incline from the planned height, bounces once, and should pass
+    through the hoop. The same drop is simulated in the tuned model, without a release error, for
+    comparison.
 
     Args:
         setup: setup of the shot: its ball, drop, incline and hoop.
@@ -54,7 +58,7 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
         model: tuned model with the plan.
     """
     times = np.arange(round(MAX_SHOT_SECONDS * SAMPLING_RATE_HZ) + 1) / SAMPLING_RATE_HZ
-    # Without a plan, the shot is a miss.
+    # Without a plan (NaN), the shot is a miss.
     if not math.isfinite(model.height):
         no_path = np.full((times.size, 3), np.nan)
         return ShotResult(False, float("nan"), float("nan"), times, no_path, no_path)
@@ -62,16 +66,14 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
     planned_path = planning_model.simulate_flights(setup.scene, np.array([model.height]), times)[0]
     # The true ball, friction and release, which the planner does not know.
     ground = InclinedGround(setup.scene.angle, settings.friction)
-    start = (
-        setup.release[0],
-        0.0,
-        setup.scene.compute_contact_height(setup.ball.radius) + model.height + setup.release[1],
-    )
+    x_error, height_error = setup.release
+    contact_height = setup.scene.compute_contact_height(setup.ball.radius)
+    start = (x_error, 0.0, contact_height + model.height + height_error)
     flown_path = simulate_shot(setup.ball, ground, start, times)
-    x, y = compute_hoop_crossings(flown_path[None], setup.scene)[0].tolist()
+    ((x, y),) = compute_hoop_crossings(flown_path[None], setup.scene).tolist()
     miss_distance = x - setup.scene.hoop_x
     is_hit = math.hypot(miss_distance, y) < setup.scene.hoop_radius
-    # Beyond the hoop's plane, nothing was planned.
+    # Compare the paths until one of them has passed the hoop's plane: nothing was planned beyond.
     last = min(
         find_descent_index(planned_path, setup.scene.hoop_z),
         find_descent_index(flown_path, setup.scene.hoop_z),
@@ -97,7 +99,7 @@ class ExampleShot(NamedTuple):
 def execute_example(
     settings: ShotConfig, setup: ShotSetup, methods: Sequence[str], stored: Mapping[str, Any]
 ) -> ExampleShot:
-    """Execute one shot again with each of some methods, because stored results contain no paths.
+    """Execute a stored shot again with some methods, because stored results contain no paths.
 
     Args:
         settings: settings of the bounce shot, from the table [shot] of the experiment.
@@ -106,7 +108,7 @@ def execute_example(
         stored: stored results by name of the shot.
     """
     models = {model["method"]: TunedModel(**model) for model in stored[setup.name]["models"]}
-    shot_results = {method: execute_shot(setup, settings, models[method]) for method in methods}
-    # Upper end of the axis, 0.1 m above the highest flight.
-    top = max(float(np.nanmax(t.flown[:, 2])) for t in shot_results.values()) + 0.1
-    return ExampleShot(models, shot_results, top)
+    results = {method: execute_shot(setup, settings, models[method]) for method in methods}
+    # 0.1 m above the highest flight.
+    top = max(float(np.nanmax(result.flown[:, 2])) for result in results.values()) + 0.1
+    return ExampleShot(models, results, top)

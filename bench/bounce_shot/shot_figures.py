@@ -58,7 +58,7 @@ def draw_figures(
     rows: pd.DataFrame,
     lines: pd.DataFrame,
 ) -> dict[str, FigureFiles]:
-    """Draw the figures of the bounce-shot study.
+    """Draw the figures of the bounce-shot study: hit rates, misses, and example shots.
 
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
@@ -69,7 +69,7 @@ def draw_figures(
         lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
 
     Returns:
-        Printed figures by name.
+        Figures by name, in all formats; without "shots" if there is no example.
     """
     figures = {
         "success": draw_success_figure(experiment, lines),
@@ -110,7 +110,7 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
         lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
     """
     panel, table = make_success_panel(lines)
-    # Width and height in inches, with the space for each category.
+    # Width and height in inches, with the space for each kind of ball.
     size = (2.0 + 1.5 * len(panel.across.names), 4.2)
     figure, axes = draw_chart([replace(panel, title="")], {panel.table: table}, size=size)
     note = "each shot with a ball and a recorded drop of its own; bars: 95 % intervals (Wilson)"
@@ -119,7 +119,7 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
 
 
 def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
-    """Draw the legend of the groups that occur, below the figure.
+    """Draw the legend of the groups of methods that are drawn, below the figure.
 
     Args:
         figure: figure of Matplotlib.
@@ -132,16 +132,16 @@ def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
     for group, (colour, marker) in _GROUP_STYLES.items():
         if group in present_groups:
             handles.append(Line2D([], [], color=colour, marker=marker, label=_GROUP_LABELS[group]))
-    columns = len(handles)
+    # All entries are in one row.
     figure.legend(
-        handles=handles, loc="outside lower center", ncols=columns, fontsize=8, frameon=False
+        handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False
     )
 
 
 def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     """Draw where shots met the hoop's plane (left) and the prediction error (right) as box plots.
 
-    Each method has one row; its colour shows the kind of the method.
+    Each method has one row. Its colour shows its group: untuned, tuned, or extended by explain.
 
     Args:
         settings: settings of the bounce shot, from the table [shot] of the experiment.
@@ -151,14 +151,13 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     # Width and height in inches, with the space for each method.
     figure, axes = make_panel_grid(1, 2, (11.5, 1.6 + 0.42 * len(methods)), sharey=True)
     miss_axis, error_axis = axes[0]
-    for place, method in enumerate(methods):
-        part = rows[rows["method"] == method]
+    for index, method in enumerate(methods):
+        rows_of_method = rows[rows["method"] == method]
         colour, _ = _GROUP_STYLES[get_method_group(method)]
-        _draw_box_plot(miss_axis, 100 * part["off"].dropna().to_numpy(), place, colour)
-        _draw_box_plot(
-            error_axis, 100 * part["prediction_error"].dropna().to_numpy(), place, colour
-        )
-    radius = 100 * settings.hoop_radius
+        for axis, column in ((miss_axis, "off"), (error_axis, "prediction_error")):
+            centimetres = 100 * rows_of_method[column].dropna().to_numpy()
+            _draw_box_plot(axis, centimetres, index, colour)
+    radius = 100 * settings.hoop_radius  # cm
     miss_axis.axvspan(-radius, radius, color=BLACK, alpha=0.08, linewidth=0)
     miss_axis.axvline(0, color=CAPTION_GREY, linewidth=0.8)
     miss_axis.set_xlabel(
@@ -184,20 +183,20 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     return figure
 
 
-def _draw_box_plot(axis: Axes, values: Array, place: int, colour: str) -> None:
+def _draw_box_plot(axis: Axes, values: Array, position: int, colour: str) -> None:
     """Draw a horizontal box plot of one method: quartiles, median, and whiskers at 5 % and 95 %.
 
     Args:
         axis: axes to draw on.
         values: miss distances or prediction errors, cm, (n,); without values nothing is drawn.
-        place: vertical position, the number of the method.
+        position: vertical position, the index of the method.
         colour: colour of the group of the method.
     """
     if not values.size:
         return
     axis.boxplot(
         values,
-        positions=[place],
+        positions=[position],
         orientation="horizontal",
         whis=(5, 95),
         widths=0.55,
@@ -215,7 +214,9 @@ def select_example_shots(
 ) -> list[tuple[ShotSetup, list[str]]]:
     """Select example shots: a typical one and the worst one of a tuned method.
 
-    The typical one is a shot that the untuned simulator missed, if there is one.
+    The tuned method is TuneNet, or the first one without it. The typical shot is one that the
+    untuned simulator missed, if there is one, with a miss distance of the tuned method closest to
+    its median. Each is shown with the untuned simulator, the tuned method, and the fit of explain.
 
     Args:
         setups: all shots.
@@ -223,59 +224,55 @@ def select_example_shots(
         rows: rows of shots.csv.
 
     Returns:
-        The shots, each with the methods to show.
+        The shots, each with the methods to show; none without a tuned method.
     """
-    by_name = {setup.name: setup for setup in setups}
-    tuned = [m for m in rows["method"].unique() if get_method_group(m) == "tuned"]
+    setup_by_name = {setup.name: setup for setup in setups}
+    methods = rows["method"].unique()
+    tuned = [method for method in methods if get_method_group(method) == "tuned"]
     if not tuned:
         return []
     reference_method = next((m for m in ("tunenet-vision", "tunenet") if m in tuned), tuned[0])
-    methods_shown = [
-        m for m in (UNTUNED_METHOD, reference_method, EXPLAIN_METHOD) if (rows["method"] == m).any()
-    ]
-    # Only shots with a result of all shown methods can be compared.
-    miss_by_method = (
-        rows.pivot(index="shot", columns="method", values="off")[methods_shown].abs().dropna()
-    )
-    if miss_by_method.empty:
+    methods_shown = [m for m in (UNTUNED_METHOD, reference_method, EXPLAIN_METHOD) if m in methods]
+    # Miss distances, m, of each shot (rows) by method (columns). Only shots with a result of all
+    # shown methods can be compared.
+    miss_distances = rows.pivot(index="shot", columns="method", values="off")[methods_shown].abs()
+    miss_distances = miss_distances.dropna()
+    if miss_distances.empty:
         return []
-    missed_shots = rows[(rows["method"] == UNTUNED_METHOD) & (rows["hit"].astype(float) == 0)][
-        "shot"
-    ]
-    missed_by_untuned = miss_by_method[miss_by_method.index.isin(missed_shots)]
-    missed_by_untuned = miss_by_method if missed_by_untuned.empty else missed_by_untuned
-    typical_shot = (
-        (missed_by_untuned[reference_method] - miss_by_method[reference_method].median())
-        .abs()
-        .idxmin()
-    )
-    worst_shot = miss_by_method[reference_method].idxmax()
+    reference_distances = miss_distances[reference_method]
+    is_missed = (rows["method"] == UNTUNED_METHOD) & (rows["hit"].astype(float) == 0)
+    candidates = reference_distances[reference_distances.index.isin(rows[is_missed]["shot"])]
+    if candidates.empty:
+        candidates = reference_distances
+    typical_shot = (candidates - reference_distances.median()).abs().idxmin()
+    worst_shot = reference_distances.idxmax()
     return [
-        (by_name[str(name)], methods_shown)
+        (setup_by_name[str(name)], methods_shown)
         for name in dict.fromkeys((typical_shot, worst_shot))
         if name in stored
     ]
 
 
 def draw_shots_figure(
-    settings: ShotConfig, chosen: Sequence[tuple[ShotSetup, list[str]]], stored: Mapping[str, Any]
+    settings: ShotConfig, examples: Sequence[tuple[ShotSetup, list[str]]], stored: Mapping[str, Any]
 ) -> Figure:
-    """Draw example shots as planned and as flown.
+    """Draw example shots as planned and as flown: one row per shot, one column per method.
 
     Args:
         settings: settings of the bounce shot, from the table [shot] of the experiment.
-        chosen: examples as returned by `select_example_shots`, one per row.
+        examples: shots with the methods to show, the typical one first.
         stored: stored results by name of the shot.
     """
-    columns = max(len(methods) for _, methods in chosen)
+    columns = max(len(methods) for _, methods in examples)
     # Width and height in inches, with the space for each shot.
-    size = (4.1 * columns, 0.9 + 3.1 * len(chosen))
-    figure, axes = make_panel_grid(len(chosen), columns, size)
-    for row, (setup, methods) in zip(axes, chosen, strict=True):
+    size = (4.1 * columns, 0.9 + 3.1 * len(examples))
+    figure, axes = make_panel_grid(len(examples), columns, size)
+    for axes_of_row, (setup, methods) in zip(axes, examples, strict=True):
         shot = execute_example(settings, setup, methods, stored)
-        for axis, method in zip(row, methods, strict=False):
+        # A shot may have fewer methods than there are columns.
+        for axis, method in zip(axes_of_row, methods, strict=False):
             draw_shot_panel(axis, setup, method, shot)
-        row[0].set_ylabel(f"{setup.name}\nheight [m]")
+        axes_of_row[0].set_ylabel(f"{setup.name}\nheight [m]")
     for axis in axes[-1]:
         axis.set_xlabel("distance [m]")
     axes[0, 0].legend(loc="upper right", fontsize=8, frameon=False)
@@ -289,28 +286,31 @@ def draw_shots_figure(
 
 
 def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot) -> None:
-    """Draw incline, hoop, planned and flown path of one shot; the flown path is the last line.
+    """Draw incline, hoop, planned and flown path of one shot, seen from the side.
+
+    The flown path is the last line of the axes, so that an animation can change it.
 
     Args:
         axis: axes to draw on.
         setup: setup of the shot: its ball, drop, incline and hoop.
-        method: name of the method.
-        shot: executed example: a shot with the path that it took.
+        method: label of the method.
+        shot: executed shot with its paths by method.
     """
     scene, flight = setup.scene, shot.results[method]
     # Ends of the drawn incline in m: behind the release, and before the hoop.
-    slope = np.array([-0.25, min(0.55 * scene.hoop_x, 0.45)])
+    incline_x = np.array([-0.25, min(0.55 * scene.hoop_x, 0.45)])
+    incline_z = -incline_x * np.tan(scene.angle)
     # Down to the lower end of the axis, -0.35 m.
-    axis.fill_between(slope, -slope * np.tan(scene.angle), -0.35, color=INCLINE_GREY, linewidth=0)
-    rim = [scene.hoop_x - scene.hoop_radius, scene.hoop_x + scene.hoop_radius]
-    level = [scene.hoop_z] * 2
-    axis.plot(rim, level, color="black", linewidth=3, solid_capstyle="butt", label="hoop")
-    for path, colour, line, name in (
-        (flight.planned, BLUE, (0, (4, 2)), "planned"),
+    axis.fill_between(incline_x, incline_z, -0.35, color=INCLINE_GREY, linewidth=0)
+    rim_x = [scene.hoop_x - scene.hoop_radius, scene.hoop_x + scene.hoop_radius]
+    rim_z = [scene.hoop_z] * 2
+    axis.plot(rim_x, rim_z, color="black", linewidth=3, solid_capstyle="butt", label="hoop")
+    for path, colour, style, name in (
+        (flight.planned, BLUE, (0, (4, 2)), "planned"),  # dashed
         (flight.flown, VERMILION, "-", "flown"),
     ):
-        part = path[: find_path_end(path, scene)]
-        axis.plot(part[:, 0], part[:, 2], linewidth=1.7, label=name, color=colour, linestyle=line)
+        x, _, z = path[: find_path_end(path, scene)].T
+        axis.plot(x, z, linewidth=1.7, label=name, color=colour, linestyle=style)
     result = f"{'hit' if flight.is_hit else 'miss'}, {100 * flight.miss_distance:+.0f} cm"
     restitution = shot.models[method].restitution
     axis.set_title(

@@ -32,7 +32,7 @@ class ShotGeometry:
         """Check that the incline descends, and that the hoop is in front of it and above it.
 
         Raises:
-            InputError: the scene is impossible.
+            InputError: it is not so.
         """
         if not (0 < self.angle < math.pi / 2 and self.hoop_x > 0 and self.hoop_radius > 0):
             raise InputError(
@@ -51,13 +51,15 @@ def compute_hoop_crossings(path: Array, scene: ShotGeometry) -> Array:
     """Return the points where paths cross the hoop's plane downwards.
 
     Only the flight after the first bounce counts: from where z first rises to where it rises again.
-    With the sample before the plane at height z1 and the one after it at z2, the hoop's plane at
-    height h is crossed on the chord between them, at the share
+    Between two samples the path is a straight line. With the sample before the plane at height z1
+    and the one after it at z2, the hoop's plane at height h is crossed at the share
 
         (z1 - h) / (z1 - z2)                                               (1)
 
+    of the way between them.
+
     Args:
-        path: Centres x, y, z of the ball (n, T, 3), m.
+        path: Centres x, y, z of the ball in n paths (n, T, 3), m.
         scene: Geometry of the shot.
 
     Returns:
@@ -68,31 +70,33 @@ def compute_hoop_crossings(path: Array, scene: ShotGeometry) -> Array:
     with np.errstate(invalid="ignore"):
         rises = z[:, 1:] > z[:, :-1]
         falls = z[:, 1:] < z[:, :-1]
+        # Whether the path has risen, fallen after that, and risen again, up to each sample.
         has_risen = np.logical_or.accumulate(rises, axis=1)
-        fallen = np.logical_or.accumulate(has_risen & falls, axis=1)
-        rises_again = np.logical_or.accumulate(fallen & rises, axis=1)
+        has_fallen = np.logical_or.accumulate(has_risen & falls, axis=1)
+        has_risen_again = np.logical_or.accumulate(has_fallen & rises, axis=1)
         # Downward only: a ball that crosses upwards has not scored.
         is_above = z[:, :-1] > scene.hoop_z
         is_below = z[:, 1:] <= scene.hoop_z
-        down = has_risen & ~rises_again & is_above & is_below
-    first = np.argmax(down, axis=1)
-    rows = np.arange(len(z))
-    high = z[rows, first]
-    low = z[rows, first + 1]
-    is_crossed = down.any(axis=1)  # for paths without a crossing, `first` is 0 and unused
+        is_crossing = has_risen & ~has_risen_again & is_above & is_below
+    # Sample before the first crossing of each path; for paths without one, it is 0 and unused.
+    before = np.argmax(is_crossing, axis=1)
+    is_crossed = is_crossing.any(axis=1)
+    paths = np.arange(len(z))
+    high = z[paths, before]
+    low = z[paths, before + 1]
     share = (high - scene.hoop_z) / np.where(is_crossed, high - low, 1.0)  # (1)
-    at_x = x[rows, first] + share * (x[rows, first + 1] - x[rows, first])
-    at_y = y[rows, first] + share * (y[rows, first + 1] - y[rows, first])
-    crossing_points = np.stack([at_x, at_y], axis=1)
+    crossing_x = x[paths, before] + share * (x[paths, before + 1] - x[paths, before])
+    crossing_y = y[paths, before] + share * (y[paths, before + 1] - y[paths, before])
+    crossing_points = np.stack([crossing_x, crossing_y], axis=1)
     result: Array = np.where(is_crossed[:, None], crossing_points, np.nan)
     return result
 
 
 def find_descent_index(path: Array, height: float) -> int:
-    """Return the index of the sample after which a path descends through a height after its bounce.
+    """Return the index of the sample after which a path descends through a height after a bounce.
 
-    The height is that of the hoop. The path before the bounce is ignored, because the ball falls
-    through the same height after its release.
+    The path before the bounce is ignored, because the ball falls through the same heights after
+    its release.
 
     Args:
         path: positions, (T, 3).
@@ -102,10 +106,10 @@ def find_descent_index(path: Array, height: float) -> int:
         Index of the sample; the last index if the path does not descend through the height.
     """
     heights = path[:, 2]
-    # Before its bounce, the ball falls through the same heights.
-    has_risen = np.logical_or.accumulate(heights[1:] > heights[:-1])
-    down = np.flatnonzero(has_risen & (heights[:-1] > height) & (heights[1:] <= height))
-    return int(down[0]) if down.size else len(heights) - 1
+    # A ball that has risen has bounced.
+    has_bounced = np.logical_or.accumulate(heights[1:] > heights[:-1])
+    is_descent = has_bounced & (heights[:-1] > height) & (heights[1:] <= height)
+    return int(np.argmax(is_descent)) if is_descent.any() else len(heights) - 1
 
 
 _MIN_DRAWN_DEPTH = 0.12
@@ -113,12 +117,12 @@ _MIN_DRAWN_DEPTH = 0.12
 
 
 def find_path_end(path: Array, scene: ShotGeometry) -> int:
-    """Return the number of samples to draw of a path, up to 0.12 m below the hoop after its bounce.
+    """Return the number of samples to draw of a path.
 
-    How it continues is not of interest.
+    After its bounce, a path is drawn down to `_MIN_DRAWN_DEPTH` below the hoop.
 
     Args:
-        path: positions, (T, 3).
+        path: positions, (T, 3), m.
         scene: incline and hoop.
     """
     return find_descent_index(path, scene.hoop_z - _MIN_DRAWN_DEPTH) + 1

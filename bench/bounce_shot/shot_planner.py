@@ -57,15 +57,15 @@ class PlanningModel:
     constants: Mapping[str, float]
 
     def simulate_flights(self, scene: ShotGeometry, heights: Array, times: Array) -> Array:
-        """Simulate the paths from several drop heights.
+        """Simulate the paths of the ball from several drop heights.
 
         Args:
             scene: Geometry of incline and hoop.
-            heights: (n,) drop heights, m.
+            heights: (n,) drop heights above contact with the incline, m.
             times: (T,) sample times, s.
 
         Returns:
-            Centres (n, T, 3), m.
+            Centres x, y, z of the ball (n, T, 3), m.
         """
         constants = {**self.constants, "incline_angle": scene.angle}
         scenarios = [
@@ -76,15 +76,18 @@ class PlanningModel:
 
 
 def plan_shot(model: PlanningModel, scene: ShotGeometry, heights: tuple[float, float]) -> ShotPlan:
-    """Find the drop height with the largest distance to the rim, by successively finer grids.
+    """Find the drop height from which the ball passes the hoop farthest from its rim.
 
-    Grids are used because the distance may have several maxima, and because heights from which the
-    hoop is not reached give no search direction.
+    Successively finer grids are simulated, because the distance may have several maxima, and
+    heights from which the hoop is not reached give no search direction.
 
     Args:
         model: Tuned model.
         scene: Geometry of incline and hoop.
         heights: Minimum and maximum height, m.
+
+    Returns:
+        The plan; without a height if the hoop's plane is not crossed from any height.
 
     Raises:
         InputError: The heights are not positive and increasing.
@@ -101,11 +104,11 @@ def plan_shot(model: PlanningModel, scene: ShotGeometry, heights: tuple[float, f
         margins = scene.hoop_radius - np.hypot(crossings[:, 0] - scene.hoop_x, crossings[:, 1])
         if not np.isfinite(margins).any():
             break
-        place = np.nanargmax(margins)
-        best = ShotPlan(float(grid[place]), float(margins[place]))
-        reach = float(grid[1] - grid[0])
+        best_index = np.nanargmax(margins)
+        best = ShotPlan(float(grid[best_index]), float(margins[best_index]))
+        spacing = float(grid[1] - grid[0])
         # Up to the neighbours of the best height: the maximum is between them.
         grid = np.linspace(
-            max(low, best.height - reach), min(high, best.height + reach), _LATER_GRID_SIZE
+            max(low, best.height - spacing), min(high, best.height + spacing), _LATER_GRID_SIZE
         )
     return best

@@ -41,7 +41,10 @@ def render_page(
     rows: pd.DataFrame,
     pictures: Mapping[str, FigureFiles],
 ) -> str:
-    """Render the HTML report.
+    """Render the HTML report of a bounce-shot study.
+
+    It names the method with the highest hit rate over all balls, and the methods whose intervals
+    reach the lower end of its interval.
 
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
@@ -55,16 +58,17 @@ def render_page(
     page.add_table("table", lines)
     page.add_table("shots", rows, 6)
     page.add_table(success_panel.table, success)
-    over = lines[lines["ball"] == ALL_BALLS].sort_values("rate", ascending=False, kind="stable")
-    best, *other_rows = over.to_dict("records")
+    lines_of_all_balls = lines[lines["ball"] == ALL_BALLS]
+    ranking = lines_of_all_balls.sort_values("rate", ascending=False, kind="stable")
+    best, *others = ranking.to_dict("records")
     return page.render(
         _TEMPLATE,
         experiment=experiment,
         folder=folder,
         ALL_BALLS=ALL_BALLS,
         best=best,
-        has_others=bool(other_rows),
-        similar=[row["method"] for row in other_rows if row["high"] >= best["low"]],
+        has_others=bool(others),
+        similar=[line["method"] for line in others if line["high"] >= best["low"]],
         success_panel=success_panel,
     )
 
@@ -93,10 +97,10 @@ def write_report(
     skipped_tuners: Mapping[str, str],
     print_line: Callable[[str], None],
 ) -> int:
-    """Write tables, figures and HTML report from the shots that exist.
+    """Write tables, figures and HTML report from the shots that exist, and print a summary.
 
-    It writes the tables (table, shots, status), the figures, the HTML page and an animation of one
-    example, and prints the result table and the failures.
+    Written are the tables table.csv, shots.csv and status.csv, the figures, the HTML page and an
+    animation of one example. Without any shot nothing is written.
 
     Args:
         folder: result folder.
@@ -109,16 +113,14 @@ def write_report(
     Returns:
         Number of methods and shots that crashed or exceeded their time.
     """
-    stored = {}
-    for setup in setups:
-        if (shot := read_shot(folder, setup)) is not None:
-            stored[setup.name] = shot
+    shots = {setup.name: read_shot(folder, setup) for setup in setups}
+    stored = {name: shot for name, shot in shots.items() if shot is not None}
     if not stored:
         print_line("no shot was made")
         return 0
     shot_rows = pd.DataFrame([row for shot in stored.values() for row in shot["rows"]])
     for name in _NULLABLE_NUMBERS:
-        # A column that is empty has no numeric type.
+        # A column whose cells are all empty has no numeric type.
         shot_rows[name] = pd.to_numeric(shot_rows[name])
     result_lines = add_trust_column(build_result_table(shot_rows), experiment)
     shot_rows = add_trust_column(shot_rows, experiment)
@@ -139,30 +141,32 @@ def write_report(
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()
     failed = shot_rows[shot_rows["status"].isin(NO_SHOT_STATUSES)]
-    rows_by_method: dict[str, dict[str, Any]] = {}
-    for row in result_lines.to_dict("records"):
-        rows_by_method.setdefault(row["method"], {})[row["ball"]] = row
-    lines = render_text(
+    # Lines of the result table by method and ball.
+    lines_by_method: dict[str, dict[str, Any]] = {}
+    for line in result_lines.to_dict("records"):
+        lines_by_method.setdefault(line["method"], {})[line["ball"]] = line
+    summary = render_text(
         _SUMMARY_TEMPLATE,
-        methods=rows_by_method,
+        methods=lines_by_method,
         balls=[ball for ball in result_lines["ball"].unique() if ball != ALL_BALLS],
         ALL_BALLS=ALL_BALLS,
-        width=max(map(len, rows_by_method)),
+        width=max(map(len, lines_by_method)),
         skipped=skipped_tuners,
         failed=[(*key, part["reason"]) for key, part in failed.groupby(["method", "status"])],
         folder=folder,
         figures=figures,
         report_file=REPORT_FILE,
     )
-    for line in lines:
-        print_line(line)
+    for text_line in summary:
+        print_line(text_line)
     return int(failed["status"].isin(_FAILED_STATUSES).sum())
 
 
 def _build_status_rows(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
     """Build the rows of status.csv: one per method and shot, and one per tuner that was skipped.
 
-    The columns are those of all comparisons; the seed is always 0, because a shot is planned once.
+    The columns are those of the status.csv of other studies, too. The seed is always 0, because a
+    shot is planned once.
 
     Args:
         rows: rows of shots.csv.
@@ -185,6 +189,7 @@ def _build_status_rows(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.Dat
     if not skipped:
         return statuses
     skipped_rows = [
+        # In the order of `STATUS_COLUMN_NAMES`.
         (label, label, SIMULATOR_NAME, "", 0, "skipped", reason, 0, 0.0, False)
         for label, reason in skipped.items()
     ]

@@ -36,7 +36,9 @@ class ShotSetup:
 def draw_shot(
     experiment: Experiment, settings: ShotConfig, kind: str, index: int, salt: str = ""
 ) -> ShotSetup:
-    """Draw a shot; the result does not depend on the methods or the number of shots.
+    """Draw the ball, the scene and the release error of a shot.
+
+    The result does not depend on the methods or the number of shots.
 
     Args:
         experiment: the experiment; its name is part of the seed.
@@ -48,18 +50,18 @@ def draw_shot(
     rng = make_rng(*get_stream_prefix(salt), experiment.name, "shot", kind, index)
     # The order of the draws is part of the experiment: another order gives other shots.
     ball = get_ball_kind(kind).draw_ball(rng)
-    angle, x, drop = (
-        float(rng.uniform(*pair)) for pair in (settings.angle, settings.hoop_x, settings.hoop_drop)
-    )
-    dx, dz = (settings.release * rng.standard_normal(2)).tolist()
-    # The centre of a ball that touches the incline at x = 0 is radius / cos(angle) above it.
-    touching = ball.radius / math.cos(angle)
-    scene = ShotGeometry(angle, x, touching - drop, settings.hoop_radius)
-    return ShotSetup(f"{kind}-{index:03d}", ball, scene, (dx, dz), salt)
+    angle = float(rng.uniform(*settings.angle))
+    hoop_x = float(rng.uniform(*settings.hoop_x))
+    hoop_drop = float(rng.uniform(*settings.hoop_drop))
+    x_error, height_error = (settings.release * rng.standard_normal(2)).tolist()
+    # Height of the centre of a ball that touches the incline at x = 0.
+    contact_height = ball.radius / math.cos(angle)
+    scene = ShotGeometry(angle, hoop_x, contact_height - hoop_drop, settings.hoop_radius)
+    return ShotSetup(f"{kind}-{index:03d}", ball, scene, (x_error, height_error), salt)
 
 
 def get_stream_prefix(salt: str) -> tuple[str, ...]:
-    """Return the first words of the names of random streams; none for a public salt."""
+    """Return the first words of the names of random streams: the salt, unless it is public."""
     return () if salt in ("", PUBLIC_SALT) else ("salt", salt)
 
 

@@ -33,18 +33,23 @@ from sims.core.simulator import InputError
 def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> dict[str, Any]:
     """Build the row of shots.csv for one method and shot.
 
-    Lengths are in m. ``off`` is the miss distance, ``margin`` the distance inside the rim of the
-    hoop, and ``planned_margin`` the one that the model predicted. Of a traceback only the last line
-    is kept as ``reason``.
+    Lengths are in m. ``off`` is the signed distance along x from the hoop's centre, ``margin`` the
+    distance to the rim of the hoop, positive inside it, and ``planned_margin`` the one that the
+    model predicted. Of a traceback only the last line is kept as ``reason``.
 
     Args:
         setup: setup of the shot: its ball, drop, incline and hoop.
         model: tuned model with the plan.
         result: result of the executed shot.
     """
+    effect_texts = [
+        f"{name} {', '.join(f'{value:.4g}' for value in values)}"
+        for name, values in model.effects.items()
+    ]
+    reason_lines = model.reason.strip().splitlines()
     return {
         "shot": setup.name,
-        "ball": setup.name.rpartition("-")[0],
+        "ball": setup.name.rpartition("-")[0],  # the name is KIND-NUMBER
         "method": model.method,
         "hit": result.is_hit,
         "off": result.miss_distance,
@@ -54,14 +59,11 @@ def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> 
         "drop_height": model.height,
         "restitution": model.restitution,
         "true_restitution": setup.ball.restitution,
-        "effects": "; ".join(
-            f"{name} {', '.join(f'{v:.4g}' for v in values)}"
-            for name, values in model.effects.items()
-        ),
+        "effects": "; ".join(effect_texts),
         "simulations": model.simulations,
         "seconds": model.seconds,
         "status": model.status,
-        "reason": model.reason.strip().splitlines()[-1] if model.reason.strip() else "",
+        "reason": reason_lines[-1] if reason_lines else "",
     }
 
 
@@ -110,13 +112,10 @@ def store_shot(
         models: models as returned by `bench.bounce_shot.tuned_shots.tune_and_plan`.
         visible_share: fraction of the drop's sample times at which its recording has a height.
     """
-    rows = [
-        {
-            **_build_shot_row(setup, model, execute_shot(setup, settings, model)),
-            "seen": visible_share,
-        }
-        for model in models
-    ]
+    rows = []
+    for model in models:
+        row = _build_shot_row(setup, model, execute_shot(setup, settings, model))
+        rows.append({**row, "seen": visible_share})
     document = to_json_value({"models": [asdict(model) for model in models], "rows": rows})
     write_atomically(
         get_shot_path(folder, setup), json.dumps(document, indent=1, allow_nan=False) + "\n"
@@ -144,10 +143,10 @@ def read_shot(folder: Path, setup: ShotSetup) -> dict[str, Any] | None:
         raise InputError(f"{path}, {error.says}; {_DAMAGE_ADVICE}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f"{path}: {_DAMAGE_ADVICE}") from None
-    expected = (setup.name, [model["method"] for model in document["models"]])
-    names = {row["shot"] for row in document["rows"]}, [row["method"] for row in document["rows"]]
-    if names != ({expected[0]}, expected[1]):
-        message = f"expected a row of {expected[0]} for each model, found others"
+    methods = [model["method"] for model in document["models"]]
+    shot_names = {row["shot"] for row in document["rows"]}
+    if shot_names != {setup.name} or [row["method"] for row in document["rows"]] != methods:
+        message = f"expected a row of {setup.name} for each model, found others"
         raise InputError(f"{path}: {message}; {_DAMAGE_ADVICE}")
     for model in document["models"]:
         # JSON has no NaN, so missing numbers are stored as null.
@@ -172,13 +171,16 @@ def check_shots(folder: Path, setups: Sequence[ShotSetup]) -> None:
 def _validate_document(document: dict[str, Any], name: str, columns: Columns) -> None:
     """Validate the models or the rows of a shot.
 
+    Both are lists of tables with declared entries. A model also has the coefficients of its
+    effects, by the name of the effect.
+
     Args:
         document: stored document of the shot.
         name: its part, ``models`` or ``rows``.
-        columns: declarations of the values.
+        columns: declarations of the entries.
 
     Raises:
-        CellError: a value does not match its declaration.
+        CellError: a value does not match its declaration; the message states part and number.
         KeyError: the part is missing.
         TypeError: the part is not a list of tables.
     """
@@ -186,14 +188,20 @@ def _validate_document(document: dict[str, Any], name: str, columns: Columns) ->
     try:
         for row, table in enumerate(tables):
             select_declared_columns(list(table), columns, row)
-            for values in table["effects"].values() if name == "models" else ():
-                try:
-                    check_cells(_COEFFICIENT, parse_json_column(_COEFFICIENT, values))
-                except CellError as error:
-                    error.row = row
-                    raise
+            if name == "models":
+                for coefficients in table["effects"].values():
+                    _validate_coefficients(coefficients, row)
         for column in columns:
             check_cells(column, parse_json_column(column, [table[column.name] for table in tables]))
     except CellError as error:
         error.says = f"{name}, {(error.row or 0) + 1}: {error.says}"
+        raise
+
+
+def _validate_coefficients(coefficients: list[Any], row: int) -> None:
+    """Validate the coefficients of an effect; an error states the model's index `row`."""
+    try:
+        check_cells(_COEFFICIENT, parse_json_column(_COEFFICIENT, coefficients))
+    except CellError as error:
+        error.row = row
         raise

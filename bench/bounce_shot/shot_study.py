@@ -65,6 +65,10 @@ class BounceShotStudy(Study):
 
         Args:
             new: folder, experiment, plugins and salt, from `prepare_study`.
+
+        Raises:
+            InputError: the packages for films are missing, or the experiment is not one of a ball
+                whose height is observed.
         """
         experiment = new.experiment
         if read_shot_config(experiment).filmed:
@@ -177,11 +181,13 @@ class _ShotStages:
     def __init__(
         self, study: BounceShotStudy, missing_shots: list[ShotSetup], progress: ProgressFactory
     ) -> None:
-        """Collect the isolated tuners, the hidden folders, and the paths of the recordings.
+        """Collect what the stages need.
 
-        Tuners that are trusted run in the worker processes and need no specification. The hidden
-        folders, which isolated tuners must not read, are the result folder and the cache of trained
-        weights.
+        * `_tuned`: how to start the isolated process of each tuner, by label. Trusted tuners run in
+          the worker processes and need no such specification.
+        * `_hidden`: folders that isolated tuners must not read: the result folder, and the cache of
+          trained weights.
+        * `_paths`: paths of the recordings of the missing shots.
 
         Args:
             study: bounce-shot study in its result folder.
@@ -201,7 +207,7 @@ class _ShotStages:
         ]
 
     def run(self, jobs: int, pool: Pool | None) -> None:
-        """Record the drops, train tuners, tune and plan, and execute the shots.
+        """Run all stages: record the drops, train tuners, tune and plan, and execute the shots.
 
         Args:
             jobs: number of worker processes.
@@ -216,19 +222,22 @@ class _ShotStages:
         # These workers know the true balls and run no tuner; other workers run the tuners.
         with make_pool(jobs) as workers:
             recording_errors = self._record_drops(workers)
-        # The true balls are in the memory of this process, and a tuner's process may run as the
-        # same user.
-        hidden = nullcontext() if self._experiment.trusted else not_dumpable()
-        with hidden, pool or make_pool(jobs) as workers:
+        # The true balls are in the memory of this process. Isolated tuners may run as the same
+        # user, so this process must not be readable for others.
+        memory_protection = nullcontext() if self._experiment.trusted else not_dumpable()
+        with memory_protection, pool or make_pool(jobs) as workers:
             workers.load_plugins(describe_plugins(self._study.plugins, self._experiment))
             weights = self._train_tuners(workers)
             self._run_shots(workers, recording_errors, weights)
 
     def _record_drops(self, workers: Pool) -> dict[int, BaseException]:
-        """Record every drop.
+        """Record the drop of every missing shot.
+
+        Args:
+            workers: pool of worker processes.
 
         Returns:
-            Errors by index of the shot.
+            Errors of drops that could not be recorded, by index of the shot.
         """
         calls: list[Call] = [
             (record_drop, (self._experiment, setup, self._settings, path))
@@ -236,17 +245,20 @@ class _ShotStages:
         ]
         step = self._progress("dropping", len(calls))
         recording_errors: dict[int, BaseException] = {}
-        for index, error in workers.iterate_results(calls, self._experiment.timeout):
-            if isinstance(error, BaseException):
-                recording_errors[index] = error
+        for index, result in workers.iterate_results(calls, self._experiment.timeout):
+            if isinstance(result, BaseException):
+                recording_errors[index] = result
             step()
         return recording_errors
 
     def _train_tuners(self, workers: Pool) -> dict[str, Path]:
-        """Train the tuners that need training.
+        """Train the tuners that need training, or load weights that were trained before.
+
+        Args:
+            workers: pool of worker processes.
 
         Returns:
-            Files of the trained weights, by label.
+            Files of the trained weights, by label of the tuner.
 
         Raises:
             Exception: a training failed; an untrained tuner must not be used as a trained one.
@@ -265,23 +277,27 @@ class _ShotStages:
         ]
         step = self._progress("training", len(calls))
         weights = {}
-        for index, training in workers.iterate_results(calls, math.inf):
-            if not isinstance(training, TrainingResult):
-                raise training
-            weights[learned_entries[index].label] = training.path
+        for index, result in workers.iterate_results(calls, math.inf):
+            if not isinstance(result, TrainingResult):
+                raise result
+            weights[learned_entries[index].label] = result.path
             step()
         return weights
 
     def _run_shots(
         self, workers: Pool, recording_errors: dict[int, BaseException], weights: dict[str, Path]
     ) -> None:
-        """Tune and plan with every method, and execute and store the shots.
+        """Tune and plan with every method, and execute and store the missing shots.
+
+        A shot whose drop could not be recorded, or whose worker failed, is stored as a miss of
+        every method.
 
         Args:
             workers: pool of worker processes.
             recording_errors: errors of drops that could not be recorded, by index of the shot.
             weights: files of trained weights, by label of the tuner.
         """
+        # Indices of the missing shots whose drop was recorded.
         recorded = [
             index for index in range(len(self._missing_shots)) if index not in recording_errors
         ]
@@ -311,8 +327,8 @@ class _ShotStages:
 
         Args:
             index: index of the shot among the missing ones.
-            models: fitted model of each method.
-            visible_share: share of the frames in which the ball was detected.
+            models: tuned model of each method, with its plan.
+            visible_share: share of the drop's sample times at which its recording has a height.
         """
         store_shot(
             self._study.folder, self._missing_shots[index], self._settings, models, visible_share
@@ -322,14 +338,14 @@ class _ShotStages:
 def _make_failed_models(
     experiment: Experiment, error: BaseException, status: str = "crashed"
 ) -> list[TunedModel]:
-    """Make failed models for a shot without a recording, or whose worker died or was too slow.
+    """Make a failed model of each method, for a shot whose recording or planning failed.
 
     None of them has a plan, so that the shot counts as a miss of every method.
 
     Args:
         experiment: the experiment with its tuners.
         error: the error of the recording or of the worker.
-        status: status of the models, unless the error is a timeout.
+        status: status of the models; it is "timeout" if the error is a timeout.
     """
     if isinstance(error, TimeoutError):
         status = "timeout"

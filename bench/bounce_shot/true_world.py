@@ -100,12 +100,13 @@ class _Flight:
     """Simulation of one ball by MuJoCo, with drag, lift and friction of this module."""
 
     def __init__(self, ball: BallKind, ground: InclinedGround, air: float) -> None:
-        """Build the MuJoCo model, and compute the factors of drag (1) and lift (2).
+        """Build the MuJoCo model, and compute the constant factors of the forces.
 
-        `_normal` is the x and z part of the unit vector normal to the ground, and `_touches` tells
-        whether the ball is in contact.
-
-        Drag is -1/2 rho Cd A |v| v (1) and lift 1/2 rho A r omega x v (2).
+        * `_drag` and `_lift`: the factors of |v| v in the drag -1/2 rho Cd A |v| v (1), and of
+          omega x v in the lift 1/2 rho A r omega x v (2), with the density rho of the air, the
+          cross section A, radius r, velocity v and spin omega of the ball.
+        * `_normal`: x and z component of the unit vector normal to the ground.
+        * `_touches`: whether the ball is in contact.
 
         Args:
             ball: properties of the ball.
@@ -129,11 +130,12 @@ class _Flight:
         """Return the distance of the ball's surface from the plane, m.
 
         Args:
-            x: position of the centre along the slope direction, m.
-            _y: unused.
+            x: position of the centre along the horizontal direction of descent, m.
+            _y: unused, so that a position can be unpacked.
             z: height of the centre, m.
         """
-        return x * self._normal[0] + z * self._normal[1] - self._ball.radius
+        normal_x, normal_z = self._normal
+        return x * normal_x + z * normal_z - self._ball.radius
 
     def run(self, start: tuple[float, float, float], times: Array) -> Array:
         """Simulate from rest at a position, and return the centres at the sample times, (T, 3).
@@ -143,32 +145,35 @@ class _Flight:
             times: sample times, increasing from 0, s, (T,).
         """
         data = self._data
-        last = float(times[-1])
         data.qpos[:3] = start
-        rows = [(0.0, *start, 0.0, 0.0, 0.0)]
-        while data.time < last:
+        # Time, position and velocity of the centre after each step.
+        steps = [(0.0, *start, 0.0, 0.0, 0.0)]
+        last_time = float(times[-1])
+        while data.time < last_time:
             self._make_step()
-            rows.append((data.time, *data.qpos[:3].tolist(), *data.qvel[:3].tolist()))
-        return _interpolate_positions(np.array(rows), times)
+            steps.append((data.time, *data.qpos[:3].tolist(), *data.qvel[:3].tolist()))
+        return _interpolate_positions(np.array(steps), times)
 
     def _make_step(self) -> None:
         """Make one step, a short one if the ball touches the ground or soon will.
 
-        At the begin of an impact the contact damping is set; it stays until the ball has left the
-        ground.
+        At the beginning of an impact the contact damping is set; it stays until the ball has left
+        the ground.
         """
         data = self._data
-        position = data.qpos[:3].tolist()
+        gap = self.gap(*data.qpos[:3].tolist())
         velocity = data.qvel.tolist()
-        gap = self.gap(*position)
-        rate = velocity[0] * self._normal[0] + velocity[2] * self._normal[1]
+        vx, _, vz, *_ = velocity
+        normal_x, normal_z = self._normal
+        # Rate of the gap, m/s; negative if the ball approaches the ground.
+        rate = vx * normal_x + vz * normal_z
         # Look two steps ahead: a step of flight must not penetrate the ground.
         is_near_impact = gap <= 0.0 or (rate < 0.0 and gap < -2.0 * _FLIGHT_STEP * rate)
         self._model.opt.timestep = _CONTACT_STEP if is_near_impact else _FLIGHT_STEP
         if gap > 0.0:
             self._touches = False
-        # Set the damping once per impact, at its initial speed: restitution refers to the whole
-        # impact.
+        # Set the damping once per impact, just before the contact, since restitution refers to the
+        # speed at which the impact begins.
         if not self._touches and rate < 0.0 and gap + rate * _CONTACT_STEP <= 0.0:
             self._set_contact_damping(-rate)
         self._apply_forces(velocity)
@@ -177,10 +182,11 @@ class _Flight:
     def _set_contact_damping(self, speed: float) -> None:
         """Set the contact damping that gives the ball's restitution, for an impact at this speed.
 
-        It also marks the begin of a contact (`_touches`), during which the damping stays constant.
+        It also marks the beginning of a contact (`_touches`), during which the damping stays
+        constant.
 
         Args:
-            speed: speed normal to the ground at the begin of the impact, m/s.
+            speed: speed normal to the ground at the beginning of the impact, m/s.
         """
         self._touches = True
         # Rounded, so that almost equal impacts share one cached result of `compute_damping_ratio`.
@@ -193,10 +199,11 @@ class _Flight:
         self._model.geom_solref[1] = -(frequency**2), -2.0 * ratio * frequency
 
     def _apply_forces(self, velocity: list[float]) -> None:
-        """Apply drag (1), lift (2) and friction (5) as force and torque of the next step.
+        """Apply drag, lift and friction as force and torque of the next step.
 
         Drag is -1/2 rho Cd A |v| v (1), and lift 1/2 rho A r omega x v (2), with the density rho of
-        air, the cross section A and radius r of the ball, its velocity v and its spin omega.
+        air, the drag coefficient Cd, the cross section A and radius r of the ball, its velocity v
+        and its spin omega. Friction acts in contact only.
 
         Args:
             velocity: velocity of the centre in m/s, and angular velocity in rad/s, (6,).
@@ -205,39 +212,41 @@ class _Flight:
         vx, vy, vz, wx, wy, wz = velocity
         # Forces are constant during the step, so they are evaluated at its midpoint.
         vz -= 0.5 * GRAVITY * self._model.opt.timestep
-        pull = -self._drag * math.sqrt(vx * vx + vy * vy + vz * vz)
-        force = [  # (1) and (2)
-            pull * vx + self._lift * (wy * vz - wz * vy),
-            pull * vy + self._lift * (wz * vx - wx * vz),
-            pull * vz + self._lift * (wx * vy - wy * vx),
-        ]
-        torque = 0.0
+        drag = -self._drag * math.sqrt(vx * vx + vy * vy + vz * vz)
+        fx = drag * vx + self._lift * (wy * vz - wz * vy)
+        fy = drag * vy + self._lift * (wz * vx - wx * vz)
+        fz = drag * vz + self._lift * (wx * vy - wy * vx)
+        torque = 0.0  # about y, the horizontal direction across the slope
         if self._data.ncon and self._friction > 0.0:
             friction = self._compute_friction(vx, vz, wy)
-            force[0] += friction * self._normal[1]
-            force[2] -= friction * self._normal[0]
+            normal_x, normal_z = self._normal
+            fx += friction * normal_z
+            fz -= friction * normal_x
             torque = -friction * self._ball.radius
-        self._data.xfrc_applied[1] = (*force, 0.0, torque, 0.0)
+        # Body 0 is the world, body 1 the ball.
+        self._data.xfrc_applied[1] = (fx, fy, fz, 0.0, torque, 0.0)
 
     def _compute_friction(self, vx: float, vz: float, spin: float) -> float:
-        """Return the Coulomb friction (5) on the ball, N, positive down the slope.
+        """Return the Coulomb friction on the ball, N, positive down the slope.
 
-        It is limited to the force that stops the slip within the step, so that it does not reverse
-        it.
-
-        The force is at most the friction cone mu N and the force that stops the slip within a step
-        h, |f| = min(mu N, k / (1 + k) m |slip| / h) (5), with the moment of inertia k m r^2.
+        It is |f| = min(mu N, k / (1 + k) m |slip| / h) (5), with the coefficient of friction mu,
+        the normal force N, mass m and moment of inertia k m r^2 of the ball, and the time step h.
+        The second term is the force that stops the slip within the step; a larger one would
+        reverse it.
 
         Args:
             vx: velocity along x, m/s.
             vz: upward velocity, m/s.
             spin: angular velocity about y, rad/s.
         """
-        slip = vx * self._normal[1] - vz * self._normal[0] - spin * self._ball.radius
+        normal_x, normal_z = self._normal
+        # Velocity of the ball's surface at the contact, down the slope.
+        slip = vx * normal_z - vz * normal_x - spin * self._ball.radius
         k = self._ball.inertia_ratio
-        stops = self._ball.mass * k / (1.0 + k) * abs(slip) / self._model.opt.timestep
+        stopping_force = self._ball.mass * k / (1.0 + k) * abs(slip) / self._model.opt.timestep
+        # The only constraint of the model is the contact.
         friction_limit = self._friction * float(self._data.efc_force[0])
-        return -math.copysign(min(stops, friction_limit), slip)  # (5)
+        return -math.copysign(min(stopping_force, friction_limit), slip)
 
 
 def _render_mjcf(ball: BallKind, ground: InclinedGround) -> str:

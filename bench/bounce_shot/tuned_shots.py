@@ -109,7 +109,10 @@ class ShotInputs:
 def tune_and_plan(
     experiment: Experiment, settings: ShotConfig, inputs: ShotInputs
 ) -> list[TunedModel]:
-    """Tune all methods to a recording, and plan a shot with each.
+    """Tune all methods to the recording of a drop, and plan a shot with each.
+
+    The methods are: the untuned simulator; each tuner in the original simulator; the fit of
+    explain; and each tuner in the simulator that explain has extended with effects.
 
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
@@ -125,14 +128,15 @@ def tune_and_plan(
         _tune_model(experiment, settings, entry, inputs, recording, {})
         for entry in experiment.tuners
     ]
-    explained, active_effects = _explain_drop(inputs.recording)
+    explained, effects_of_drop = _explain_drop(inputs.recording)
     models.append(explained)
     # If explain failed, there is no extended simulator to tune.
     if explained.status == "done":
         extended_models = [
-            _tune_model(experiment, settings, entry, inputs, recording, active_effects)
+            _tune_model(experiment, settings, entry, inputs, recording, effects_of_drop)
             for entry in experiment.tuners
         ]
+        # The shot is planned with those effects that act on a shot, too.
         models += [
             replace(model, method=model.method + EXPLAIN_SUFFIX, effects=explained.effects)
             for model in extended_models
@@ -154,10 +158,10 @@ def _tune_model(
     recording: Recording,
     effects: EffectCoefficients,
 ) -> TunedModel:
-    """Run a tuner on the recorded drop, in the simulator with given effects.
+    """Run a tuner on the recorded drop, in a simulator with fixed effects.
 
-    The tuner starts at the nominal parameters and sees only the drop, as pixel rows of the film or
-    as heights.
+    The tuner starts at the nominal parameters and sees only the drop: heights, or pixel rows of the
+    film if the settings list the tuner for these.
 
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
@@ -168,8 +172,8 @@ def _tune_model(
         effects: coefficients of the effects that explain found; empty for the original simulator.
 
     Returns:
-        The tuned model without a plan; with the status "crashed" if the experiment or recording
-        cannot be used.
+        The tuned model without a plan and without effects; with the status "crashed" if the
+        experiment or recording cannot be used.
     """
     label, radius = entry.label, _get_run_constants(recording)["radius"]
     experiment = make_tuning_experiment(experiment, settings, entry)
@@ -184,6 +188,7 @@ def _tune_model(
             if label in settings.rows
             else _make_observed_runs(recording, experiment)
         )
+        # All of the drop is for fitting; no run is held out.
         no_runs = ObservedRuns((), np.empty((0, observed_runs.observed.shape[1])))
         target = BlindedTarget(inputs.name, "real", start, observed_runs, no_runs)
         request = RunRequest(
@@ -200,9 +205,10 @@ def _tune_model(
     except InputError as error:
         return TunedModel(label, _get_nominal_restitution(), {}, 0, 0.0, "crashed", str(error))
     trace = outcome.trace
-    tuned_value = float(problem.cube.to_physical(trace.recommendations[-1])[0])
+    # The restitution is the only parameter.
+    restitution = float(problem.cube.to_physical(trace.recommendations[-1])[0])
     return TunedModel(
-        label, tuned_value, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason
+        label, restitution, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason
     )
 
 
@@ -222,10 +228,12 @@ def make_tuning_experiment(
 
 
 def _make_observed_runs(recording: Recording, experiment: Experiment) -> ObservedRuns:
-    """Convert the recorded run to fitting data of the experiment's simulator.
+    """Convert the recorded run to observed heights for the experiment's simulator.
 
-    The ball is released at rest at time 0, even if it is first seen later. Heights are shifted to
-    the radius of the experiment, because one trained network serves balls of all sizes.
+    * The ball is released at rest at time 0, even if it is first seen later. So its initial state
+      is the first height and the speed that it has reached by then.
+    * Heights are shifted as if the ball had the radius of the experiment, because one trained
+      network serves balls of all sizes.
 
     Args:
         recording: recording of the ball's drop.
@@ -233,21 +241,20 @@ def _make_observed_runs(recording: Recording, experiment: Experiment) -> Observe
     """
     (run,) = recording.runs
     scenario = make_scenario(run, BallSimulator(observe=["z"]), recording.constants)
-    # The radius of the experiment replaces that of the ball: one network serves balls of all sizes.
+    constants = _get_run_constants(recording)
     radius = experiment.fixed["radius"]
-    shift = radius - _get_run_constants(recording)["radius"]
-    z = run.channels["z"] + shift
-    visible_heights = run.channels["z"][np.isfinite(run.channels["z"])]
-    # Released at rest at t = 0, the ball has the speed g t when it is first seen.
-    speed = scenario.constants.get("gravity", _get_run_constants(recording)["gravity"]) * float(
-        run.times[0]
-    )
+    shift = radius - constants["radius"]
+    heights = run.channels["z"]
+    visible_heights = heights[np.isfinite(heights)]
+    # After a free fall of t seconds the speed is g t.
+    speed = scenario.constants.get("gravity", constants["gravity"]) * float(run.times[0])
+    # Initial states that the recording states precede these.
     first = {"z": float(visible_heights[0]), "vz": -speed, **scenario.initial}
     initial = {**first, "z": first["z"] + shift}
     shifted_scenario = Scenario(
         scenario.times, initial, {}, {**scenario.constants, "radius": radius}
     )
-    return ObservedRuns((shifted_scenario,), z[:, None])
+    return ObservedRuns((shifted_scenario,), (heights + shift)[:, None])
 
 
 def _get_run_constants(recording: Recording) -> dict[str, float]:
@@ -256,7 +263,7 @@ def _get_run_constants(recording: Recording) -> dict[str, float]:
 
 
 def _explain_drop(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
-    """Run explain on the recording of the drop; its fit is a model of its own.
+    """Run explain on the recording of the drop, and convert its fit to a tuned model.
 
     An error of explain does not stop the other methods: the model then has the status "crashed".
 
@@ -264,7 +271,8 @@ def _explain_drop(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
         recording: CSV file of the recording.
 
     Returns:
-        Its model, with the effects that act on the shot, and all effects that it found.
+        The model, with the effects that act on a shot; and the coefficients of all effects of the
+        drop that explain found, such as those of the camera.
     """
     from bench.diagnosis.explain import explain
 
@@ -272,16 +280,9 @@ def _explain_drop(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
     try:
         explanation = explain(recording)
     except Exception:  # the failure of one method is a row of the table
-        traceback_text = traceback.format_exc()
-        return TunedModel(
-            EXPLAIN_METHOD,
-            _get_nominal_restitution(),
-            {},
-            0,
-            perf_counter() - started,
-            "crashed",
-            traceback_text,
-        ), {}
+        nominal, seconds = _get_nominal_restitution(), perf_counter() - started
+        reason = traceback.format_exc()
+        return TunedModel(EXPLAIN_METHOD, nominal, {}, 0, seconds, "crashed", reason), {}
     all_effects = {
         name: tuple(number.value for number in numbers.values())
         for name, numbers in explanation.extended.effects.items()
@@ -304,8 +305,8 @@ def select_transferable_effects(
 ) -> dict[str, tuple[float, ...]]:
     """Select the effects of a drop that act on a shot.
 
-    They are effects of the ball and the air, not of the camera. A constant vertical force is
-    converted to a change of gravity.
+    They are effects of the ball and the air, which change a force or a contact, and not those of
+    the camera. A constant vertical force is converted to a change of gravity.
 
     Args:
         effects: coefficients by name.
@@ -313,24 +314,26 @@ def select_transferable_effects(
     """
     from sims import effects as library
 
-    carried: dict[str, tuple[float, ...]] = {}
-    for name, values in effects.items():
-        kind = library.get_effect(name)
-        # A constant acceleration c along z is a change of gravity by -c / g.
+    selected: dict[str, tuple[float, ...]] = {}
+    for name, coefficients in effects.items():
+        effect = library.get_effect(name)
         if name == "force.bias":
-            carried["gravity.scale"] = (-values[0] / gravity,)
-        elif kind.hook in ("force", "contact") and kind.fits(ShotSystem):
-            carried[name] = tuple(values)
-    return carried
+            # A constant acceleration c along z is a relative change of gravity by -c / g.
+            selected["gravity.scale"] = (-coefficients[0] / gravity,)
+        elif effect.hook in ("force", "contact") and effect.fits(ShotSystem):
+            selected[name] = tuple(coefficients)
+    return selected
 
 
 def make_planning_model(model: TunedModel, settings: ShotConfig, radius: float) -> PlanningModel:
     """Make the model in which a shot is planned: a bounce shot with the effects of a tuned model.
 
+    The drop does not show friction and moment of inertia of the ball, so they are assumed.
+
     Args:
         model: tuned model; its effects act with fixed coefficients.
-        settings: settings of the bounce shot, from the table [shot] of the experiment; they have
-            what the planner assumes of a ball.
+        settings: settings of the bounce shot, from the table [shot] of the experiment, with the
+            assumed friction and moment of inertia.
         radius: radius of the ball, m.
     """
     constants = {
@@ -373,7 +376,10 @@ ROW_CHANNEL = "v"
 
 
 def make_pixel_experiment(experiment: Experiment, settings: ShotConfig) -> Experiment:
-    """Make the experiment for a ball in front of an unknown camera.
+    """Make the experiment for a tuner that sees pixel rows of a film and not the camera.
+
+    It simulates a filmed ball. The radius of the ball, the camera's azimuth, distance and height
+    are drawn at random from ranges, for training; pixel rows have no noise in addition.
 
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
@@ -398,9 +404,10 @@ def make_pixel_experiment(experiment: Experiment, settings: ShotConfig) -> Exper
 
 
 def build_pixel_runs(recording: Recording, experiment: Experiment, radius: float) -> ObservedRuns:
-    """Convert tracked rows to observations at the experiment's sample times.
+    """Convert the tracked pixel rows of a drop to observations at the experiment's sample times.
 
-    Samples in which the tracker saw nothing are NaN.
+    The ball is released at rest at time 0, even if it is first seen later. Samples without a
+    tracked ball, and all heights, which a tuner for pixel rows does not get, are NaN.
 
     Args:
         recording: a tracked drop, with the rows as extra column `v`.
@@ -412,11 +419,12 @@ def build_pixel_runs(recording: Recording, experiment: Experiment, radius: float
     # The recording may begin later or skip samples; each row is assigned by its time.
     indices = np.rint(run.times * experiment.sampling.rate).astype(np.intp)
     is_inside = indices < times.size
+    # The channels are z and the pixel row v.
     observed: Array = np.full((times.size, 2), np.nan)
     observed[indices[is_inside], 1] = run.extra[ROW_CHANNEL][is_inside]
     heights = run.channels["z"]
     first = int(np.flatnonzero(np.isfinite(heights))[0])
     gravity = recording.constants["gravity"]
-    # Released at rest at t = 0, and possibly first seen later: z(t) = z(0) - g t^2 / 2.
-    height = float(heights[first] + 0.5 * gravity * run.times[first] ** 2)
-    return ObservedRuns((Scenario(times, {"z": height}, {}, {"radius": radius}),), observed)
+    # Free fall from the release to the first seen height: z(t) = z(0) - g t^2 / 2.
+    drop_height = float(heights[first] + 0.5 * gravity * run.times[first] ** 2)
+    return ObservedRuns((Scenario(times, {"z": drop_height}, {}, {"radius": radius}),), observed)

@@ -97,7 +97,7 @@ class DataSet:
     def folder(self) -> Path | None:
         """Return the folder of the data set on this machine, or None if it is not there.
 
-        A folder counts only if it contains all files that commands read (`provides`).
+        A folder is only accepted if it contains all files that commands read (`provides`).
         """
         for parent in list_search_folders(self.kind):
             if all((parent / self.name / file).is_file() for file in self.provides):
@@ -126,14 +126,14 @@ def list_search_folders(kind: str) -> Iterator[Path]:
 
 
 def find(kind: str, path: str) -> Path | None:
-    """Find the file `path` below the folders of a kind of data sets.
+    """Find a file of a data set in the folders of this machine.
 
     Args:
-        kind: kind of data set.
-        path: path below the folder.
+        kind: kind of data set, "recording" or "robot".
+        path: path of the file, with the name of the data set as its folder.
 
     Returns:
-        The first file found, or None.
+        The first file found; None if there is none, or the path cannot be that of a file.
     """
     for folder in list_search_folders(kind):
         try:
@@ -164,12 +164,14 @@ def find_providing_data_set(kind: str, path: str) -> DataSet | None:
     """Return the data set that provides a file of an experiment, or None.
 
     Args:
-        kind: kind of data set.
+        kind: kind of data set, "recording" or "robot".
         path: path of the file, with the name of the data set as its folder.
     """
-    folder, _, file = path.replace("\\", "/").rpartition("/")
-    data_set = _read_catalogue().get(folder)
-    return data_set if data_set and data_set.kind == kind and file in data_set.provides else None
+    name, _, file = path.replace("\\", "/").rpartition("/")
+    data_set = _read_catalogue().get(name)
+    if data_set is None or data_set.kind != kind or file not in data_set.provides:
+        return None
+    return data_set
 
 
 @cache
@@ -184,16 +186,17 @@ def _make_data_set(name: str, table: dict[str, object]) -> DataSet:
 
     Args:
         name: name of the table and of the data set.
-        table: keys and values; those of `DataSet`, with ``files`` as a list of tables.
+        table: its entries, named as the attributes of `DataSet`, with ``files`` as a list of
+            tables.
     """
-    fields: dict[str, object] = dict(table)
-    files = fields.pop("files")
-    provides = fields.pop("provides")
+    other_entries: dict[str, object] = dict(table)
+    files = other_entries.pop("files")
+    provides = other_entries.pop("provides")
     assert isinstance(files, list)
     assert isinstance(provides, list)
     return DataSet(
         name=name,
         files=tuple(SourceFile(**file) for file in files),
         provides=tuple(provides),
-        **fields,  # type: ignore[arg-type]  # keys of the package's own file
+        **other_entries,  # type: ignore[arg-type]  # keys of the package's own file
     )

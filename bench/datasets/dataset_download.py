@@ -53,9 +53,10 @@ gravity = 9.81    # m/s^2
 def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
     """Convert the free swing of the single pendulum to a recording with runs of 5 s.
 
-    The MATLAB file holds one swing at 1 ms, divided into pieces: ``Y_id`` and ``Y_vad`` are cell
-    arrays of (2, T) angles (pi is hanging) and rates. The pieces are joined, every fifth sample is
-    kept, and the angle is measured from hanging. Runs from number 7 on are held out.
+    The MATLAB file holds one swing, sampled every 1 ms and divided into pieces: ``Y_id`` and
+    ``Y_vad`` are cell arrays of pieces (2, T) with angles in rad (pi is hanging) and rates in
+    rad/s. The pieces are joined, every fifth sample is kept, and the angle is measured from
+    hanging. Runs from number 7 on are held out. The samples after the last whole run are left out.
 
     Args:
         files: Contents of the downloaded files by name.
@@ -67,20 +68,21 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
         InputError: the file does not have this form.
     """
     (name,) = [name for name in files if name.endswith(".mat")]
-    swing = _join_records(name, files[name])[:, ::_DECIMATION]
-    q = np.round(swing[0], _DECIMALS) - np.pi
-    qd = np.round(swing[1], _DECIMALS)
-    runs = swing.shape[1] // _SAMPLES_PER_RUN
-    if runs == 0:
+    angles, rates = _join_records(name, files[name])[:, ::_DECIMATION]
+    q = np.round(angles, _DECIMALS) - np.pi
+    qd = np.round(rates, _DECIMALS)
+    run_count = q.size // _SAMPLES_PER_RUN
+    if run_count == 0:
         raise InputError(
             f"{name}: expected at least {_SAMPLES_PER_RUN * _DECIMATION} samples of 1 ms"
         )
-    run_indices, samples = np.divmod(np.arange(runs * _SAMPLES_PER_RUN), _SAMPLES_PER_RUN)
-    t = samples * _DECIMATION * _PERIOD_MS / 1000
+    # Index of the run, and of the sample in its run, for each row of the table.
+    run_indices, samples = np.divmod(np.arange(run_count * _SAMPLES_PER_RUN), _SAMPLES_PER_RUN)
+    t = samples * _DECIMATION * _PERIOD_MS / 1000  # s
     columns = (run_indices + 1, t, q[: t.size], qd[: t.size])
     table = io.StringIO()
     np.savetxt(table, np.stack(columns, axis=1), "%.7g", ",", header="run,t,q,qd", comments="")
-    held_out = range(_HELD_OUT_FROM, runs + 1)
+    held_out = range(_HELD_OUT_FROM, run_count + 1)
     description = _FREE_SWING + "".join(f"\n[runs.{run}]\nheld_out = true\n" for run in held_out)
     return {"recording.csv": table.getvalue(), "recording.toml": description}
 
@@ -128,15 +130,18 @@ Advance = Callable[[int], None]
 def download(
     data_set: DataSet, folder: Path, source: str = "", advance: Advance = lambda _: None
 ) -> Path:
-    """Write a data set into the folder NAME below `folder`.
+    """Download a data set, check and convert its files, and write them into the folder NAME.
+
+    The files are used as they are if the data set has no conversion. Its licence and a note on its
+    source are always written.
 
     Args:
         data_set: data set of the catalogue: its files, source and licence.
-        folder: parent folder of the data sets of this kind; created if it does not exist.
+        folder: parent folder of NAME; created if it does not exist.
         source: source of the files instead of their public repository: a folder that contains them,
             such as a clone at the data set's commit, or an address that serves the repository's
             files; empty for the public repository.
-        advance: called when bytes are received.
+        advance: called with the number of bytes whenever some are received.
 
     Returns:
         The data set's folder.
@@ -151,16 +156,16 @@ def download(
             f"{target}: exists and does not contain {' and '.join(data_set.provides)}; "
             "delete it, or choose another folder with --out"
         )
-    contents = {
+    downloaded = {
         file.name: _check_content(file, *_fetch_file(data_set, file, source, advance))
         for file in data_set.files
     }
-    written: dict[str, Content] = dict(contents)
+    contents: dict[str, Content] = dict(downloaded)
     if data_set.conversion:
-        licence = {"LICENSE": contents["LICENSE"]}
-        written = {**CONVERSIONS[data_set.conversion](contents), **licence}
-    written["SOURCE.txt"] = _format_provenance(data_set)
-    _write_folder(target, written)
+        contents = CONVERSIONS[data_set.conversion](downloaded)
+        contents["LICENSE"] = downloaded["LICENSE"]
+    contents["SOURCE.txt"] = _format_provenance(data_set)
+    _write_folder(target, contents)
     return target
 
 
@@ -194,7 +199,8 @@ def _read_file(
 ) -> tuple[str, bytes]:
     """Read a file from a folder that contains a clone, or the files without subfolders.
 
-    At most one byte more than expected is read: enough to see that the file is too long.
+    At most one byte more than expected is read: enough for the later check to see that the file is
+    too long.
 
     Args:
         data_set: Data set that has the file.
@@ -228,7 +234,8 @@ def _read_file(
 def _download_content(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -> bytes:
     """Download the content of an address, in blocks.
 
-    At most one byte more than expected is received: enough to see that the file is too long.
+    At most one byte more than expected is received: enough for the later check to see that the file
+    is too long.
 
     Args:
         url: Address of the file.
@@ -245,9 +252,9 @@ def _download_content(url: str, data_set: DataSet, file: SourceFile, advance: Ad
     request = urllib.request.Request(url, headers={"User-Agent": f"simgap/{__version__}"})
     content = b""
     try:
-        with urllib.request.urlopen(request, timeout=_TIMEOUT) as answer:
+        with urllib.request.urlopen(request, timeout=_TIMEOUT) as response:
             while len(content) <= file.bytes:
-                block = answer.read(min(_READ_BLOCK_BYTES, file.bytes + 1 - len(content)))
+                block = response.read(min(_READ_BLOCK_BYTES, file.bytes + 1 - len(content)))
                 if not block:
                     break
                 content += block
@@ -288,7 +295,9 @@ def _check_content(file: SourceFile, location: str, content: bytes) -> bytes:
 
 
 def _format_provenance(data_set: DataSet) -> str:
-    """Format SOURCE.txt: source, citation, licence and hashes of the files.
+    """Format the text of SOURCE.txt: source, citation, licence and hashes of the files.
+
+    It also says how files were converted, if they were.
 
     Args:
         data_set: Data set with its repository, commit, licence and files.
