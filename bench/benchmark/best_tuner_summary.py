@@ -85,7 +85,7 @@ class RangeResult:
         """Number of targets of the range: ``10 targets``, or how many of them decide.
 
         A target decides between tuners if its data determine at least one direction of the
-        parameters.
+        parameters. Targets of a recording (``real``) differ in their starting points only.
         """
         count = self.statistics.target_counts[self.kind]
         unit = ("starting point" if self.kind == "real" else "target") + ("" if count == 1 else "s")
@@ -170,8 +170,8 @@ class RangeResult:
 def _sort_by_verdict(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> TunerRanking:
     """Sort the tuners of one range by their verdict after `k` simulations.
 
-    One tuner has the verdict `BEST`, the lowest median error; others may be `EQUAL` to it. The
-    error in the sentence is that of the best one.
+    One tuner has the verdict `BEST`, the lowest median error, unless all of them failed; others may
+    be `EQUAL` to it. The stated error is that of the best one.
 
     Args:
         statistics: statistics of the comparison.
@@ -184,35 +184,52 @@ def _sort_by_verdict(statistics: ComparisonStatistics, k: int, part: pd.DataFram
 
     # Equal tuners are in the order of legends, so that a page has one order.
     best = sorted(select_verdicts(BEST, EQUAL)["tuner"], key=statistics.order.index)
-    first = select_verdicts(BEST)
+    error_text = ""
+    if len(best_row := select_verdicts(BEST)):
+        error_text = _format_best_error(statistics, float(best_row["median"].iloc[0]))
     return TunerRanking(
-        k,
-        [str(name) for name in best],
-        _format_best_error(statistics, float(first["median"].iloc[0])) if len(first) else "",
-        [_format_worse_tuner(row) for row in select_verdicts(WORSE).to_dict("records")],
-        [str(name) for name in select_verdicts(UNDECIDED)["tuner"]],
-        [str(name) for name in select_verdicts(FAILED)["tuner"]],
+        simulations=k,
+        best=[str(name) for name in best],
+        error=error_text,
+        worse=[_format_worse_tuner(row) for row in select_verdicts(WORSE).to_dict("records")],
+        undecided=[str(name) for name in select_verdicts(UNDECIDED)["tuner"]],
+        failed=[str(name) for name in select_verdicts(FAILED)["tuner"]],
     )
 
 
 def _format_best_error(statistics: ComparisonStatistics, median: float) -> str:
-    """Format the median error of the best tuner in the unit of the statistics.
+    """Format the median error of the best tuner, such as ``0.012`` or ``at most 0.001``.
 
-    An error at or below the negligible error (`floor`) is given as an upper limit, because smaller
-    differences have no meaning. A median that is not finite means that half of the targets failed.
+    An error at or below the negligible error (`statistics.floor`) is given as an upper limit,
+    because smaller differences have no meaning. A median that is not finite means that half of the
+    targets failed.
+
+    Args:
+        statistics: statistics of the comparison.
+        median: median error over targets, in training widths if true parameters are known.
     """
     if not np.isfinite(median):
         return "it failed on half of the targets"
+    # `unit` converts training widths to the unit of the parameter if there is only one.
     text = f"{median * statistics.unit:.2g}"
+    # 1e-9 is a tolerance for rounding.
     return f"at most {text}" if median <= statistics.floor * (1 + 1e-9) else text
 
 
 def _format_worse_tuner(row: dict[Any, Any]) -> str:
-    """Format a worse tuner, e.g. ``cma_es 5.8x (8/10)``."""
+    """Format a tuner that is significantly worse than the best one, e.g. ``cma_es 5.8x (8/10)``.
+
+    Its median error is 5.8 times that of the best tuner, and larger on 8 of 10 targets.
+
+    Args:
+        row: row of the ranking table.
+    """
     ratio = float(row["error_ratio"])
-    factor = f" {format_number(ratio, _DIGITS)}x" if ratio > 1.0 else ""
-    # A failed run has an infinite error.
-    factor = factor if np.isfinite(ratio) else " failed"
+    factor = ""
+    if not np.isfinite(ratio):  # a failed run has an infinite error
+        factor = " failed"
+    elif ratio > 1.0:
+        factor = f" {format_number(ratio, _DIGITS)}x"
     return f"{row['tuner']}{factor} ({row['targets_worse']}/{row['targets']})"
 
 

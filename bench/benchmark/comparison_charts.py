@@ -62,6 +62,7 @@ def make_axis_labels(experiment: Experiment) -> AxisLabels:
     parameter = ""
     if len(parameters) == 1:
         unit = parameters[0].unit
+        # The unit of a pure number is "1".
         parameter = parameters[0].name + (f" [{unit}]" if unit != "1" else "")
     return AxisLabels(f"{channel.name} [{channel.unit}]", parameter)
 
@@ -126,10 +127,11 @@ class ComparisonView:
         return " [training widths]" if in_widths else ""
 
     def format_metric_label(self, metric: str) -> str:
-        """Return the axis label of an error.
+        """Return the axis label of an error, with its unit.
 
         Errors along stiff directions are those of parameter combinations that the data determine,
-        sloppy ones those of the others.
+        sloppy ones those of the others. A training width is the width of the range of a parameter
+        in which learned tuners train.
 
         Args:
             metric: Column of the run table, such as "param_error" or "obs_error".
@@ -192,23 +194,26 @@ def make_error_chart(view: ComparisonView) -> ComparisonChart:
         return _make_median_chart(
             view, "errors", [(m, "real") for m in available_metrics], side_by_side="error"
         )
-    keys = [(view.statistics.parameter_error_metric, kind) for kind in view.ranges]
-    # If the targets come from another simulator, the misfit has its own figure.
+    metrics_and_ranges = [(view.statistics.parameter_error_metric, kind) for kind in view.ranges]
+    # If the targets come from another simulator (`world`), the misfit has its own figure.
     if not view.experiment.world:
-        keys += [("obs_error", kind) for kind in view.ranges]
-    return _make_median_chart(view, "errors", keys)
+        metrics_and_ranges += [("obs_error", kind) for kind in view.ranges]
+    return _make_median_chart(view, "errors", metrics_and_ranges)
 
 
 def make_misfit_chart(view: ComparisonView) -> ComparisonChart:
-    """Make the chart of the misfit, if the targets come from another simulator.
+    """Make the chart of the misfit, for targets that come from another simulator.
 
-    The smallest possible misfit is unknown; the smallest that any tuner reached is an upper bound.
+    The misfit is the RMS error of the tuned simulator on the observations of a target. The smallest
+    possible misfit is unknown; the smallest that any tuner reached is an upper bound, and is drawn
+    as a line.
 
     Args:
         view: Comparison with its statistics and styles of tuners.
     """
     chart = _make_median_chart(view, "misfit", [("obs_error", kind) for kind in view.ranges])
     panels = []
+    # There is one panel for each range, in this order.
     for panel, kind in zip(chart.panels, view.ranges, strict=False):
         runs = view.statistics.select_range(kind)
         smallest = float(runs.groupby("target")["obs_error"].min().median())
@@ -236,7 +241,7 @@ def list_directional_metrics(stored: StoredComparison) -> list[str]:
 def _make_median_chart(
     view: ComparisonView,
     table: str,
-    keys: Sequence[tuple[str, str]],
+    metrics_and_ranges: Sequence[tuple[str, str]],
     side_by_side: str = SIDE_BY_SIDE,
 ) -> ComparisonChart:
     """Make panels of median errors against the number of simulations.
@@ -244,13 +249,13 @@ def _make_median_chart(
     Args:
         view: comparison with its statistics, experiment and styles of tuners.
         table: name of the table of the panels.
-        keys: metric and range of targets of each panel.
+        metrics_and_ranges: metric and range of targets of each panel.
         side_by_side: facet whose panels are side by side.
     """
     statistics, budget = view.statistics, view.experiment.budget
     x_axis = make_simulations_axis(budget)
     frames, panels = [], []
-    for metric, kind in keys:
+    for metric, kind in metrics_and_ranges:
         medians = statistics.compute_median_curves(metric, kind)
         frames.append(medians.assign(range=kind, metric=metric))
         conditions = {"range": kind, "metric": metric}
@@ -260,21 +265,21 @@ def _make_median_chart(
             view, kind, table, "simulations", lines, x_axis, Axis(f"{label}, median", "log")
         )
         title = panel.title
-        # A recording has one range only; its panels differ in the runs.
+        # A recording has one range only, so its panels are named after their errors.
         if kind == "real":
             title = f"{PANEL_TITLES[metric]} ({statistics.target_counts[kind]} starting points)"
+        # Below this error tuners count as equal; None for a metric that decides nothing.
         floor = statistics.get_error_floor(metric)
         rules: tuple[ReferenceLine, ...] = ()
         if floor is not None:
             rules = (ReferenceLine(floor, f"below {floor:.2g}: count as equal"),)
         facets = {**panel.facets, "error": label}
         panels.append(replace(panel, facets=facets, rules=rules, title=title))
-    medians = pd.concat(frames, ignore_index=True)
     return ComparisonChart(
         _select_panels_with_data(panels),
-        {table: medians},
+        {table: pd.concat(frames, ignore_index=True)},
         side_by_side,
-        _make_notes(view, _find_coinciding_tuners(statistics, keys)),
+        _make_notes(view, _find_coinciding_tuners(statistics, metrics_and_ranges)),
     )
 
 
@@ -351,6 +356,7 @@ def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
             view, table[table["range"] == kind], "share", "steps", range=kind
         )
         panel = _make_panel(view, kind, "runtime", "simulations", lines, x_axis, y_axis)
+        # The title counts only the targets that have the deciding error.
         targets = view.statistics.curves.select(range=str(kind)).keys["target"].nunique()
         panels.append(replace(panel, title=f"{PANEL_TITLES[str(kind)]} ({targets} targets)"))
     return ComparisonChart(panels, {"runtime": table}, notes=_make_notes(view))
@@ -379,9 +385,9 @@ def make_ert_chart(view: ComparisonView) -> ComparisonChart:
 def make_cost_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of seconds per target by the cost of a simulation, with the winners.
 
-    The seconds per target have the training cost of learned tuners in them, divided among
-    `TARGETS_PER_TRAINING` targets. A bar at the foot of a panel names the cheapest tuner at each
-    cost of a simulation.
+    One panel for each range of targets and error threshold that has to be reached. The seconds per
+    target contain the training cost of learned tuners, divided among `TARGETS_PER_TRAINING`
+    targets. A bar at the foot of a panel names the cheapest tuner at each cost of a simulation.
 
     Args:
         view: Comparison with its statistics, experiment and styles of tuners.
@@ -395,8 +401,8 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
     for level in view.levels:
         costs = view.statistics.tuning_costs[level]
         table = build_time_per_target_table(costs)
-        rank = table.groupby(["range", "tuner"]).cumcount()
-        tables.append(table[rank % _THINNING_STEP == 0].assign(threshold=level))
+        point_index = table.groupby(["range", "tuner"]).cumcount()
+        tables.append(table[point_index % _THINNING_STEP == 0].assign(threshold=level))
         for kind in view.ranges:
             winners = list(find_cheapest_tuners(costs.get(kind, {}), TARGETS_PER_TRAINING))
             mark_styles = view.get_tuner_styles(tuner for _, _, tuner in winners)
@@ -418,8 +424,9 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
 def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
     """Make the chart of the number of targets from which on a training pays.
 
-    For each untrained tuner and each learned tuner, the chart shows how many targets have to be
-    tuned until the training has saved as many simulations as it cost.
+    For each untrained tuner ("tuner that searches") and each learned tuner, the chart shows how
+    many targets have to be tuned until the training has saved as many simulations as it cost. One
+    panel for each range of targets and error threshold.
 
     Args:
         view: Comparison with its statistics, experiment and styles of tuners.
@@ -443,6 +450,7 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
                 build_break_even_table(view.experiment.name, kind, level, costs[kind])
             )
             break_even_rows = break_even_rows[break_even_rows["learned"].isin(trained)]
+            # `row` is the position of the untrained tuner on the axis of names.
             tables.append(
                 break_even_rows.assign(row=break_even_rows["search"].map(searching.index))
             )
@@ -464,26 +472,26 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
 
 
 def split_by_training(view: ComparisonView, level: float) -> tuple[list[str], list[str]]:
-    """List the searching tuners, and the trained ones that reach an error in some range.
+    """List the untrained tuners, and the trained ones that reach an error in some range.
 
     Args:
         view: Comparison with its statistics, experiment and styles of tuners.
-        level: The error.
+        level: The error threshold to be reached.
 
     Returns:
-        Two lists, each in the order of the ranking.
+        Untrained tuners and trained tuners, each list in the order of the ranking.
     """
-    by_range = view.statistics.tuning_costs[level].values()
-    costs = {
-        tuner: [by_tuner[tuner] for by_tuner in by_range if tuner in by_tuner]
-        for tuner in view.style.order
-    }
-    trained = [t for t in costs if any(cost.fit_simulations for cost in costs[t])]
-    searching = [t for t in costs if costs[t] and t not in trained]
-    reaching = [
-        t for t in trained if any(cost.effort.compute_ert() < float("inf") for cost in costs[t])
-    ]
-    return searching, reaching
+    costs_by_range = view.statistics.tuning_costs[level].values()
+    untrained, trained = [], []
+    for tuner in view.style.order:
+        costs = [by_tuner[tuner] for by_tuner in costs_by_range if tuner in by_tuner]
+        if not any(cost.fit_simulations for cost in costs):
+            if costs:
+                untrained.append(tuner)
+        # The expected running time (ERT) is infinite if no run reaches the error.
+        elif any(cost.effort.compute_ert() < float("inf") for cost in costs):
+            trained.append(tuner)
+    return untrained, trained
 
 
 CHARTS: Mapping[str, Callable[[ComparisonView], ComparisonChart]] = {
@@ -539,7 +547,7 @@ def _make_panel(
 
 
 def _add_error_threshold(panel: Panel, view: ComparisonView, level: float) -> Panel:
-    """Add the error threshold to a panel's facets.
+    """Add the error threshold to a panel's facets, among which a reader chooses panels.
 
     Args:
         panel: the panel.
@@ -571,6 +579,7 @@ def _make_tuner_series(
         where: values of further columns, by which the rows are selected.
     """
     styles = view.get_tuner_styles(table["tuner"])
+    # Points of several tuners in one category are shifted, so that they lie side by side.
     options: dict[str, Any] = {"low": low, "high": high, "draw": draw, "where": where}
     return make_method_series(styles, "tuner", y, is_shifted=draw == "points", **options)
 
@@ -625,24 +634,23 @@ def find_coinciding_curves(
     """
     notes = {}
     names = list(curves_by_tuner)
-    for place, name in enumerate(names):
-        longest = 0
-        for upper_name in names[place + 1 :]:
-            if len(curves_by_tuner[upper_name]) != len(curves_by_tuner[name]):
+    for name_index, name in enumerate(names):
+        curves = curves_by_tuner[name]
+        longest_coincidence = 0
+        for upper_name in names[name_index + 1 :]:
+            upper_curves = curves_by_tuner[upper_name]
+            # A tuner that misses a panel covers nothing there.
+            if len(upper_curves) != len(curves):
                 continue
-            pairs = list(zip(curves_by_tuner[name], curves_by_tuner[upper_name], strict=True))
-            upto = min(
-                _count_equal_simulations(hidden_curve, upper_curve)
-                for hidden_curve, upper_curve in pairs
-            )
+            last_equal = min(map(_count_equal_simulations, curves, upper_curves))
             has_progress = any(
-                (hidden_curve.loc[:upto] < 0.5 * hidden_curve.iloc[0]).any()
-                for hidden_curve, _ in pairs
+                (curve.loc[:last_equal] < 0.5 * curve.iloc[0]).any() for curve in curves
             )
-            if upto > longest and has_progress:
-                longest = upto
-                is_complete = all(upto == hidden_curve.index[-1] for hidden_curve, _ in pairs)
-                notes[name] = f"same as {upper_name}" + ("" if is_complete else f" up to {upto}")
+            if last_equal > longest_coincidence and has_progress:
+                longest_coincidence = last_equal
+                is_whole_curve = all(last_equal == curve.index[-1] for curve in curves)
+                suffix = "" if is_whole_curve else f" up to {last_equal}"
+                notes[name] = f"same as {upper_name}{suffix}"
     return notes
 
 
@@ -655,6 +663,7 @@ def _count_equal_simulations(first: pd.Series[float], second: pd.Series[float]) 
     """
     points = first.index.intersection(second.index)
     first_errors, second_errors = first[points].to_numpy(), second[points].to_numpy()
+    # True up to the first visible difference.
     is_equal = np.logical_and.accumulate(
         np.abs(first_errors - second_errors)
         <= _MAX_INVISIBLE_DIFFERENCE * np.maximum(first_errors, second_errors)

@@ -113,7 +113,6 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
     ):
         range_rows = table[table["range"] == kind]
         targets = range_rows["target"].nunique()
-        # Markers of one direction lie side by side within 0.3, the ranges 0.4 apart.
         target_indices = range_rows.groupby("direction").cumcount()
         target_offsets = (
             # Marks of the targets are spread over 0.3 of the distance of two directions.
@@ -251,7 +250,7 @@ _LAYOUTS = {
 
 
 def list_figure_names(stored: StoredComparison) -> list[str]:
-    """List the names of the figures that a comparison's data allow; empty without a run.
+    """List the names of the figures for which a comparison has data; empty without a run.
 
     Returns:
         Keys of `FIGURE_FILES`, in its order.
@@ -264,10 +263,12 @@ def list_figure_names(stored: StoredComparison) -> list[str]:
         "error": True,
         # Without a true system other than the simulator, the misfit is only the sensor noise.
         "misfit": bool(experiment.world),
+        # `outside` is the distance of the true parameters from the training range.
         "distance": has_wide_range
         and bool(runs.loc[runs["range"] == "wide", "outside"].gt(0).any()),
         "runtime": True,
         "cost": True,
+        # Some tuner was trained.
         "amortisation": any(simulations for simulations, _ in stored.costs.values()),
         "spectra": stored.spectra is not None,
         "directions": bool(list_directional_metrics(stored)),
@@ -331,6 +332,7 @@ def check_references_allowed(
             f"expected {len(REFERENCE_GREYS)} references at most, found {len(references)}"
         )
     for reference in references:
+        # Differences of settings are allowed; another problem is an error, which this raises.
         reference.find_mismatches(stored.experiment)
 
 
@@ -344,8 +346,10 @@ def _draw_chart_figure(
     """
     chart, layout = CHARTS[name](view), _LAYOUTS[name]
     panels = select_first_panels(chart.panels, (chart.side_by_side, layout.rows))
+    # With several rows, there is a column for each value of the facet that is side by side.
     columns = len({panel.facets[chart.side_by_side] for panel in panels}) if layout.rows else 0
     figure, axes = draw_chart(panels, chart.tables, columns, layout.size, layout.horizontal)
+    # Each note of a tuner has its own line in the legend.
     notes = {name: note.replace("; ", "\n") for name, note in chart.notes.items()}
     style = TunerStyles(view.experiment, view.statistics.order, references, notes)
     for axis, panel in zip(axes, panels, strict=True):
@@ -380,6 +384,7 @@ def _draw_reference_lines(
         reference: results to draw.
         style: line style of each tuner.
     """
+    # All series of a panel have the same range and metric.
     conditions = panel.series[0].where
     for tuner in reference.tuners:
         curve = reference.get_curve(

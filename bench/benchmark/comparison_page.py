@@ -53,7 +53,13 @@ class ComparisonReportData:
 
 
 def explain_first(worse: Sequence[str]) -> list[str]:
-    """Write out the first of several worse tuners, which explains the format of the others."""
+    """Write out the first of several worse tuners, which explains the format of the others.
+
+    ``cma_es 5.8x (8/10)`` becomes ``cma_es 5.8x the error (larger on 8 of 10 targets)``.
+
+    Args:
+        worse: texts of tuners that are significantly worse than the best one.
+    """
     first = [
         re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", text)
         for text in worse[:1]
@@ -119,6 +125,7 @@ def render_page(results: ComparisonReportData) -> str:
     view = results.view
     page = HtmlPage({FIGURE_FILES[name]: files for name, files in results.pictures.items()})
     page.add_tables(results.tables)
+    # Every chart has a printed figure if it has data, except for that of running times (ERT).
     charts = {
         name: make_chart(view) if name in results.pictures or name == "ert" else None
         for name, make_chart in CHARTS.items()
@@ -127,6 +134,7 @@ def render_page(results: ComparisonReportData) -> str:
         page.add_tables(chart.tables if chart else {}, _DIGITS)
     statuses = view.stored.statuses
     values = collect_text_values(results)
+    # Rankings by range; `together` has those of all ranges after the same number of simulations.
     rankings = [result.rankings for result in values["range_results"]]
     return page.render(
         _TEMPLATE,

@@ -159,8 +159,9 @@ def draw_with_references(
         if name in comparison_figures.OVERLAYABLE_FIGURES:
             figure = comparison_figures.draw_figure(stored, labels, name, references=references)
             file_name = f"{before}{comparison_figures.FIGURE_FILES[name]}-behind"
-            files += write_figure(figure, out / "figures" / file_name)
-            print_line(f"figure  {files[-2]}")
+            paths = write_figure(figure, out / "figures" / file_name)
+            files += paths
+            print_line(f"figure  {paths[0]}")
     return [reference.to_document(stored.experiment, files) for reference in references]
 
 
@@ -199,16 +200,18 @@ def _list_error_tables(
         whether it has errors in unseen scenarios.
     """
     metrics, statistics = set(lines["metric"]), view.statistics
+    # The row of a skipped tuner has no range.
     for kind in lines["range"][lines["range"] != ""].unique():
         preferred = ("heldout_error", "obs_error") if kind == "real" else ("param_abs_error",)
         metric = next((name for name in preferred if name in metrics), "param_error")
         medians = build_summary(lines, metric, kind, statistics.order_in(kind))
         training = lines.drop_duplicates("tuner").set_index("tuner")["fit_simulations"]
         medians["trained on"] = [
-            f"{training[t]:.0f}" if training[t] else "-" for t in medians.index
+            f"{training[tuner]:.0f}" if training[tuner] else "-" for tuner in medians.index
         ]
         table = medians.rename(index=statistics.format_label)
-        yield kind, metric, table, *_build_direction_errors(lines, kind, view)
+        direction_table, has_heldout_errors = _build_direction_errors(lines, kind, view)
+        yield kind, metric, table, direction_table, has_heldout_errors
 
 
 def _build_direction_errors(
@@ -216,12 +219,17 @@ def _build_direction_errors(
 ) -> tuple[pd.DataFrame | None, bool]:
     """Build the table of errors along directions, and of held-out errors, of one range.
 
-    The table is None if there are none; the second result is whether it has held-out errors.
+    A column is a kind of error after some number of simulations, such as ``stiff 10``: the error
+    along directions of the parameter space that the data determine (stiff), along those that they
+    do not (sloppy), or in unseen scenarios.
 
     Args:
         lines: error curves: one row for each tuner, range, metric and number of simulations.
         kind: range of the targets; ``real`` for a recording.
         view: the comparison.
+
+    Returns:
+        The table, None without such errors; and whether it has held-out errors.
     """
     statistics = view.statistics
     titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}
@@ -234,11 +242,13 @@ def _build_direction_errors(
     shown_lines = shown_lines.assign(
         column=shown_lines["metric"].map(titles) + " " + shown_lines["simulations"].astype(str)
     )
-    order = [
-        f"{t} {k}" for t in titles.values() for k in sorted(shown_lines["simulations"].unique())
+    column_order = [
+        f"{title} {k}"
+        for title in titles.values()
+        for k in sorted(shown_lines["simulations"].unique())
     ]
     medians = shown_lines.pivot(index="tuner", columns="column", values="median")
-    medians = medians[[c for c in order if c in medians]].dropna(axis=1, how="all")
+    medians = medians[[c for c in column_order if c in medians]].dropna(axis=1, how="all")
     medians = medians.reindex([t for t in statistics.order_in(kind) if t in medians.index])
     table = medians.rename(index=statistics.format_label)
     return table, "heldout_error" in set(shown_lines["metric"])
@@ -275,13 +285,14 @@ def format_failures(failed: pd.DataFrame) -> list[str]:
     if not lines:
         return []
     lines.insert(0, ("tuner", "runs", "status", "first reason"))
-    a, b, c = (max(len(line[i]) for line in lines) for i in range(3))
+    tuner_width, runs_width, status_width = (max(len(line[i]) for line in lines) for i in range(3))
     laid_out = [
-        f"{tuner:{a}}  {runs:>{b}}  {status:{c}}  {reason}".rstrip()
+        f"{tuner:{tuner_width}}  {runs:>{runs_width}}  {status:{status_width}}  {reason}".rstrip()
         for tuner, runs, status, reason in lines
     ]
-    refused = [reason.endswith(ISOLATION_NOTE) for reason in failed["reason"].astype(str)]
-    isolated_tuners = list(dict.fromkeys(failed["tuner"][refused].astype(str)))
+    # The isolation may have caused these failures; its note is written once for all of them.
+    is_refused = [reason.endswith(ISOLATION_NOTE) for reason in failed["reason"].astype(str)]
+    isolated_tuners = list(dict.fromkeys(failed["tuner"][is_refused].astype(str)))
     note = [f"{', '.join(isolated_tuners)}: {ISOLATION_NOTE}"] if isolated_tuners else []
     return ["", "failures", *laid_out, *note]
 

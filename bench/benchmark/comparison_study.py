@@ -128,7 +128,7 @@ class Comparison(Study):
                     f"{self.folder / SEGMENTS_FOLDER / PLAN_FILE}: its plan is not the one that "
                     "its configuration gives; start a new comparison"
                 )
-            self._check_kept(journal, ids)
+            self._check_stored_rows(journal, ids)
         except InputError:
             journal.close()
             raise
@@ -137,7 +137,7 @@ class Comparison(Study):
             write_plan(self.folder, ids)
         results.run_sink = journal
 
-    def _check_kept(self, journal: RunJournal, ids: list[str]) -> None:
+    def _check_stored_rows(self, journal: RunJournal, ids: list[str]) -> None:
         """Check every stored row before a study is continued: damaged rows would falsify results.
 
         Args:
@@ -149,6 +149,7 @@ class Comparison(Study):
         """
         experiment, first_row = self.configuration.experiment, 0
         statuses = check_journal_statuses(journal.path, journal.statuses, experiment, ids)
+        # The index is the position of the run in the plan.
         statuses.index = list(journal.statuses)
         for indices, rows in journal.iterate_tables():
             file = RunsTable(journal.path, JOURNAL_REMEDY, rows, first_row)
@@ -171,7 +172,7 @@ class Comparison(Study):
         statuses = read_comparison(self.folder, ["run", "tuner", "k"]).statuses
         executed = statuses[statuses["status"] != "skipped"]
         rows = executed[["run", "tuner", "status", "reason"]].to_numpy().tolist()
-        return [RunEnd(*row) for row in rows]
+        return [RunEnd(run, tuner, status, reason) for run, tuner, status, reason in rows]
 
     def run(
         self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
