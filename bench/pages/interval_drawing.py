@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 SCALE_WIDTH = 180.0
 """Width of the scale; the drawing is 200 wide, with margins for the marks."""
-
-
 _MARGIN = 10.0
 
 

@@ -9,14 +9,12 @@ from time import perf_counter
 
 _FAST_EXCHANGE_SECONDS = 5e-4
 """Duration of an exchange in seconds below which both sides should share a processor."""
-
-
 _MEASURED_EXCHANGES = 16
 """Number of exchanges that are measured before a decision."""
-
-
 _REMEASURE_SECONDS = 1.0
 """Seconds after which the decision is repeated, because other work may use the processor."""
+_ANY_PROCESSOR_FLAG = 255
+"""Flag that lets the other side run on any processor; flags are one byte."""
 
 
 class AffinityController:
@@ -33,12 +31,14 @@ class AffinityController:
         self._pinned = False
 
     def record_exchange(self) -> int:
-        """Count an exchange of messages, and return flags that tell the other side where to run.
+        """Count an exchange of messages, and return a flag that tells the other side where to run.
 
-        0 means no change, 255 any processor, and n + 1 processor n. After every
-        `_MEASURED_EXCHANGES` exchanges, their mean duration decides: fast exchanges pin both sides
-        to one processor, slow ones release them. A pin is also released after some time, to measure
-        without it.
+        After every `_MEASURED_EXCHANGES` exchanges, their mean duration decides: fast exchanges pin
+        both sides to one processor, slow ones release them. A pin is also released after some time,
+        to measure without it.
+
+        Returns:
+            0 for no change, `_ANY_PROCESSOR_FLAG`, or n + 1 for processor n.
         """
         self._count += 1
         if self._count % _MEASURED_EXCHANGES:
@@ -48,7 +48,7 @@ class AffinityController:
         self._since = now
         if self._pinned and (mean > _FAST_EXCHANGE_SECONDS or now > self._until):
             self.release_affinity()
-            return 255
+            return _ANY_PROCESSOR_FLAG
         if not self._pinned and mean < _FAST_EXCHANGE_SECONDS:
             return self._pin_to_current_processor(now)
         return 0
@@ -56,12 +56,12 @@ class AffinityController:
     def _pin_to_current_processor(self, now: float) -> int:
         """Pin this side to the processor that it uses now, until `now` plus `_REMEASURE_SECONDS`.
 
-        Returns processor number + 1, the flag for the other side; 0 (no change) if the processor is
-        unknown or its number does not fit into the flag, which is one byte (255 means any
-        processor).
+        Returns:
+            The flag for the other side, the number of the processor + 1; 0 (no change) if the
+            processor is unknown or its number does not fit into the flag.
         """
         processor = _read_current_processor()
-        if self._home is None or not 0 <= processor < 254:
+        if self._home is None or not 0 <= processor < _ANY_PROCESSOR_FLAG - 1:
             return 0
         os.sched_setaffinity(0, {processor})
         self._pinned, self._until = True, now + _REMEASURE_SECONDS
@@ -82,13 +82,12 @@ def _read_current_processor() -> int:
         return -1
 
 
-def set_processor(processor: int) -> None:
-    """Run on the processor that the harness uses, where alternating is faster."""
+def set_processor(flag: int) -> None:
+    """Run this process where the harness runs, because alternating is faster on one processor.
+
+    Args:
+        flag: result of `AffinityController.record_exchange`, not 0.
+    """
+    processors = range(os.cpu_count() or 1) if flag == _ANY_PROCESSOR_FLAG else {flag - 1}
     with suppress(OSError, AttributeError):
-        os.sched_setaffinity(
-            0, {processor} if processor < _ANY_PROCESSOR else range(os.cpu_count() or 1)
-        )
-
-
-_ANY_PROCESSOR = 254
-"""Processor number that represents all processors."""
+        os.sched_setaffinity(0, processors)

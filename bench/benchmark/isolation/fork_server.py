@@ -47,12 +47,16 @@ def send_request(link: socket.socket, request: Any, descriptors: tuple[int, ...]
     body = json.dumps(request).encode()
     socket.send_fds(link, [_LENGTH_FORMAT.pack(len(body))], descriptors)
     link.sendall(body)
+    # The server confirms with one byte; nothing is received if it has ended.
     if not link.recv(1):
         raise BrokenPipeError
 
 
 def _receive_request(link: socket.socket) -> tuple[dict[str, Any], list[int]] | None:
-    """Return a request with its open files; None if the client has closed its socket."""
+    """Return a request with its open files; None if the client has closed its socket.
+
+    A request is its length, to which up to three file descriptors are attached, and then JSON.
+    """
     head, descriptors, _, _ = socket.recv_fds(link, _LENGTH_FORMAT.size, 3)
     if len(head) < _LENGTH_FORMAT.size:
         return None
@@ -76,6 +80,7 @@ def serve_fork_requests(descriptor: int) -> None:
         while (received := _receive_request(link)) is not None:
             request, descriptors = received
             _preload_modules(request["modules"])
+            # Only a request for a process has descriptors; `fork` returns 0 in the new process.
             if descriptors and not os.fork():
                 link.close()
                 try:
@@ -140,7 +145,8 @@ def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: 
 def _wait_for_child(child: int, control: int) -> int:
     """Wait for the end of a process, and kill it when the client closes the control socket.
 
-    The process is watched through a descriptor of its end, or else asked for it regularly.
+    Its end is signalled by a pidfd, a descriptor that becomes readable then. On a system without
+    it, the process is checked every `_POLL_MILLISECONDS`.
 
     Args:
         child: id of the process.
@@ -151,13 +157,14 @@ def _wait_for_child(child: int, control: int) -> int:
     """
     events = select.poll()
     events.register(control, select.POLLIN)
-    interval = None
+    poll_interval = None
     try:
         events.register(os.pidfd_open(child), select.POLLIN)
     except (AttributeError, OSError):
-        interval = _POLL_MILLISECONDS
+        poll_interval = _POLL_MILLISECONDS
     while True:
-        if control in dict(events.poll(interval)):
+        # The client never sends anything, so this event means that it has closed the socket.
+        if control in dict(events.poll(poll_interval)):
             os.kill(child, signal.SIGKILL)
             _, status = os.waitpid(child, 0)
             return os.waitstatus_to_exitcode(status)
@@ -188,6 +195,7 @@ def _run_service(request: dict[str, Any], pipes: list[int], layers: list[str]) -
     os.environ.update({"HOME": policy.folder, "TMPDIR": policy.folder})
     module, _, function = request["service"].partition(":")
     serve = getattr(importlib.import_module(module), function)
+    # The layer "memory" consists of a user namespace.
     layers = [*layers, *isolation_layers.lock_down(policy, "memory" in layers)]
     serve(MessageChannel(reading, writing), policy, isolation_layers.sort_layers(layers))
 

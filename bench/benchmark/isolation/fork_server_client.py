@@ -28,18 +28,12 @@ from sims.engines.compiled.machine_code_cache import get_cache_folder
 
 _EXIT_WAIT_SECONDS = 5.0
 """Time in seconds that the fork server has to end after its link is closed."""
-
-
 _BOOTSTRAP_CODE = (
     "import sys; sys.path[:] = {path!r}; "
     "from bench.benchmark.isolation.fork_server import serve_fork_requests; "
     "serve_fork_requests({descriptor})"
 )
-
-
 _PRELOADED_MODULES = ("numpy.random", "bench.benchmark.isolation.tuner_server")
-
-
 _NUMERICAL_VARIABLE_PREFIXES = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
 """Prefixes of environment variables that determine how numerical libraries compute."""
 
@@ -54,13 +48,12 @@ class ForkServerClient:
         current folder for modules. `_loaded` are the modules that it has already imported;
         processes that it forks start fast, because they inherit these modules.
         """
-        self._place: LockedFolder | None = create_locked_folder()
-        self._folder = self._place.path
+        self._scratch_folder: LockedFolder | None = create_locked_folder()
+        self._folder = self._scratch_folder.path
         self._loaded: set[str] = set()
         self._link, server_link = socket.socketpair()
-        path = [place for place in sys.path if place not in ("", str(PROJECT_ROOT))] + [
-            str(PROJECT_ROOT)
-        ]
+        root = str(PROJECT_ROOT)
+        path = [*(folder for folder in sys.path if folder not in ("", root)), root]
         code = _BOOTSTRAP_CODE.format(path=path, descriptor=server_link.fileno())
         self._process = subprocess.Popen(
             [sys.executable, "-c", code],
@@ -168,9 +161,9 @@ class ForkServerClient:
             self._process.wait(timeout=_EXIT_WAIT_SECONDS)
         self._process.kill()
         self._process.wait()
-        if self._place is not None:
-            self._place.remove()
-            self._place = None
+        if self._scratch_folder is not None:
+            self._scratch_folder.remove()
+            self._scratch_folder = None
         # Workers that have ended may have left their folders.
         remove_stale_folders()
 

@@ -90,12 +90,15 @@ def _list_readable_paths(hidden: tuple[str, ...], packages: tuple[str, ...]) -> 
         site.getusersitepackages(),
         *packages,
     ]
+    # If this project is installed as a wheel, its root is the folder of all packages.
+    is_checkout = not (PROJECT_ROOT / "numpy").exists()
     readable_paths = []
     for text in candidates:
-        place = Path(text or ".").resolve()
-        is_project_root = place == PROJECT_ROOT and not (PROJECT_ROOT / "numpy").exists()
-        if not is_project_root and not any(path.is_relative_to(place) for path in hidden_paths):
-            readable_paths.append(str(place))
+        # An empty entry of `sys.path` is the current folder.
+        folder = Path(text or ".").resolve()
+        contains_hidden = any(path.is_relative_to(folder) for path in hidden_paths)
+        if not contains_hidden and not (is_checkout and folder == PROJECT_ROOT):
+            readable_paths.append(str(folder))
     libraries = [str(Path(prefix) / "lib") for prefix in sorted(interpreter)]
     project_packages = [str(PROJECT_ROOT / name) for name in _IMPORTABLE_PATHS]
     return tuple(dict.fromkeys([*readable_paths, *libraries, *project_packages, *_SYSTEM_PATHS]))
@@ -133,8 +136,8 @@ def mount_empty_folder(folder: str) -> list[str]:
     with _try_restriction(active, "disk"):
         linux_syscalls.unshare(linux_syscalls.CLONE_NEWNS)
         linux_syscalls.make_mounts_private()
-        # This comes before the mount of its own writable folder. File times and permissions could
-        # pass information to other runs.
+        # File times and permissions could pass information to other runs. This comes before the
+        # mount of the writable folder, which it would make read-only too.
         with _try_restriction(active):
             linux_syscalls.make_mounts_read_only()
         linux_syscalls.mount_filesystem(

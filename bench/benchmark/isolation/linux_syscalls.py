@@ -43,6 +43,8 @@ _LANDLOCK_ADD_RULE = 445
 """Number of the system call landlock_add_rule."""
 _LANDLOCK_RESTRICT = 446
 """Number of the system call landlock_restrict_self."""
+_LANDLOCK_RULE_PATH_BENEATH = 1
+"""Type of a Landlock rule on a file, or on a folder and its content."""
 _LANDLOCK_READ = 1 << 0 | 1 << 2 | 1 << 3
 """Landlock rights to execute (as a library is), to read a file, and to read a folder."""
 _LANDLOCK_ALL = ((1, (1 << 13) - 1), (2, 1 << 13), (3, 1 << 14), (5, 1 << 15))
@@ -91,8 +93,8 @@ def prctl(option: int, value: Any = 0, further: Any = 0) -> None:
 
     Args:
         option: number of the option.
-        value: first argument.
-        further: second argument.
+        value: first argument of the option, an integer.
+        further: second argument of the option, such as a pointer; 0 for none.
 
     Raises:
         OSError: the call failed.
@@ -138,6 +140,8 @@ _MS_CAREFUL = 0b1110
 
 _MOUNT_SETATTR = 442
 """Number of the system call mount_setattr."""
+_AT_FDCWD = -100
+"""AT_FDCWD: relative paths begin at the current folder."""
 _AT_RECURSIVE = 0x8000
 """AT_RECURSIVE: mount_setattr changes all mounts below the given one too."""
 _READ_ONLY = 0b0011
@@ -175,7 +179,7 @@ def make_mounts_read_only() -> None:
     """
     attributes = struct.pack("<QQQQ", _READ_ONLY, 0, 0, 0)
     size = ctypes.c_size_t(len(attributes))
-    current_folder = ctypes.c_int(-100)
+    current_folder = ctypes.c_int(_AT_FDCWD)
     call_system(
         _MOUNT_SETATTR, current_folder, b"/", ctypes.c_uint(_AT_RECURSIVE), attributes, size
     )
@@ -300,7 +304,11 @@ def _add_landlock_rule(rules: int, path: str, rights: int) -> None:
             rights &= _LANDLOCK_OF_A_FILE
         attributes = struct.pack("<Qi", rights, descriptor)
         call_system(
-            _LANDLOCK_ADD_RULE, ctypes.c_int(rules), ctypes.c_int(1), attributes, ctypes.c_uint32(0)
+            _LANDLOCK_ADD_RULE,
+            ctypes.c_int(rules),
+            ctypes.c_int(_LANDLOCK_RULE_PATH_BENEATH),
+            attributes,
+            ctypes.c_uint32(0),
         )
     finally:
         os.close(descriptor)

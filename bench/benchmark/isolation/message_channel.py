@@ -44,6 +44,12 @@ MAX_HARNESS_MESSAGE_BYTES = 1 << 40
 """Maximum size of a message from the harness in bytes; practically unlimited, as it is trusted."""
 
 
+EVALUATION_SIMULATOR_FLAG = 1
+"""Flag of a message P of a training: it concerns the simulator for evaluation, not for training."""
+SIMULATE_FLAG = 2
+"""Flag of a message P of a training: points are to be simulated."""
+
+
 class PeerClosedError(Exception):
     """The process on the other side has ended."""
 
@@ -73,7 +79,7 @@ class Message(NamedTuple):
         Raises:
             ProtocolError: its size is not that of an array.
         """
-        if len(self.body) % 8:
+        if len(self.body) % 8:  # bytes per float64
             raise ProtocolError("it sent an incomplete number")
         return np.frombuffer(self.body, dtype="<f8").astype(np.float64)
 
@@ -203,7 +209,7 @@ class MessageChannel:
             raise ProtocolError(f"it sent {length} bytes at once, {limit} are allowed")
         if received > _HEADER.size + length:
             raise ProtocolError("it sent a message without a request")
-        received -= _HEADER.size
+        received -= _HEADER.size  # from here on, the number of bytes of the body
         if _HEADER.size + length > _MAX_READ_BYTES:
             return Message(kind, flags, size, self._read_long_body(received, length, deadline))
         body = self._view[_HEADER.size : _HEADER.size + length]
@@ -281,8 +287,8 @@ def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
     try:
         descriptions = json.loads(line)
         arrays, offset = {}, 0
-        for name, kind, shape in descriptions[:_MAX_ARRAYS]:
-            array, offset = _read_array(payload, offset, kind, shape)
+        for name, dtype, shape in descriptions[:_MAX_ARRAYS]:
+            array, offset = _read_array(payload, offset, dtype, shape)
             arrays[_check_array_name(name)] = array
     except (ValueError, TypeError, KeyError, RecursionError):
         raise ProtocolError("it sent invalid arrays") from None
@@ -307,14 +313,14 @@ _NAME_LENGTH = 500
 
 
 def _read_array(
-    data: memoryview, offset: int, kind: str, shape: Sequence[int]
+    data: memoryview, offset: int, dtype: str, shape: Sequence[int]
 ) -> tuple[NDArray[Any], int]:
     """Read the array at a position of a message, after checking its type, shape and size.
 
     Args:
         data: bytes of all arrays.
-        offset: position of the array.
-        kind: type of the array.
+        offset: position of the array in bytes.
+        dtype: type of the array, such as ``<f8``.
         shape: shape of the array.
 
     Returns:
@@ -323,14 +329,15 @@ def _read_array(
     Raises:
         ValueError: type or shape are not valid.
     """
-    if kind not in _ARRAY_TYPES or not all(type(n) is int and 0 <= n < 1 << 40 for n in shape):
+    # `type` and not `isinstance`, because True is an integer too.
+    if dtype not in _ARRAY_TYPES or not all(type(n) is int and 0 <= n < 1 << 40 for n in shape):
         raise ValueError
-    size = int(np.dtype(kind).itemsize)
+    size = int(np.dtype(dtype).itemsize)
     for n in shape:
         size *= n
     if size > len(data) - offset:
         raise ValueError
-    array = np.frombuffer(data[offset : offset + size], dtype=kind).reshape(shape)
+    array = np.frombuffer(data[offset : offset + size], dtype=dtype).reshape(shape)
     return array.copy(), offset + size
 
 

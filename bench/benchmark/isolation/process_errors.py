@@ -9,8 +9,6 @@ ISOLATION_NOTE = (
     "tuners run isolated: no files, no processes, no network; use --trust while developing"
 )
 """Note that is added to an error that the isolation of the tuner may have caused."""
-
-
 _REFUSED_ACCESS_PATTERN = re.compile(
     r"^[\w.]*(PermissionError|BlockingIOError|FileNotFoundError|Connection\w*Error|gaierror"
     r"|BrokenProcessPool|TerminatedWorkerError)\b"
@@ -43,9 +41,10 @@ class KilledExternallyError(Exception):
 
 
 def with_isolation(reason: str) -> str:
-    """Return a reason with `ISOLATION_NOTE` at its end, if the isolation may be the cause.
+    """Append `ISOLATION_NOTE` to the reason of a failure that the isolation may have caused.
 
-    It may be if an exception in the traceback is about an access that the isolation refuses.
+    That is so if an exception in the traceback is about an access that the isolation refuses, such
+    as to a file or to the network. Any other reason is returned unchanged.
 
     Args:
         reason: traceback of an isolated tuner.

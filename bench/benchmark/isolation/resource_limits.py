@@ -12,12 +12,8 @@ from sims.core.simulator import InputError
 
 MAX_FOLDER_BYTES = 64 << 20
 """Size of a tuner's own folder in bytes."""
-
-
 _MAX_OPEN_FILES = 512
 """Maximum number of open files of a tuner."""
-
-
 _MAX_THREADS = 1024
 """Maximum number of threads of a user's tuners; those of a superuser are not counted."""
 
@@ -39,15 +35,17 @@ def limited_memory(mebibytes: int) -> Iterator[None]:
         yield
         return
     resource = import_resource_module()
-    previous_limits = resource.getrlimit(resource.RLIMIT_DATA)
+    previous_soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_DATA)
     # The limit is relative to the present size, which depends on the packages loaded.
     limit = _read_data_bytes() + mebibytes * 2**20
-    soft = limit if previous_limits[1] == resource.RLIM_INFINITY else min(limit, previous_limits[1])
-    resource.setrlimit(resource.RLIMIT_DATA, (soft, previous_limits[1]))
+    if hard_limit != resource.RLIM_INFINITY:
+        limit = min(limit, hard_limit)
+    # Only the soft limit is lowered, because a process cannot raise its hard limit again.
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard_limit))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_DATA, previous_limits)
+        resource.setrlimit(resource.RLIMIT_DATA, (previous_soft_limit, hard_limit))
 
 
 def limit_memory(mebibytes: int) -> None:
@@ -105,7 +103,7 @@ def set_resource_limits(has_user_namespace: bool) -> None:
         **({resource.RLIMIT_NPROC: _MAX_THREADS} if has_user_namespace else {}),
     }
     for limit, maximum in limits.items():
-        hard_limit = resource.getrlimit(limit)[1]
+        _, hard_limit = resource.getrlimit(limit)
         value = maximum if hard_limit == resource.RLIM_INFINITY else min(maximum, hard_limit)
         resource.setrlimit(limit, (value, value))
 

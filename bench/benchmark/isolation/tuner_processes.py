@@ -141,6 +141,7 @@ class IsolatedProcess:
                 self._control.shutdown(socket.SHUT_WR)
             self._wait_for_exit_code(START_TIMEOUT_SECONDS)
         self._control.close()
+        # Without the layer "disk", the process had no folder of its own.
         if "disk" not in self.seals:
             self._empty_shared_folder()
         return code
@@ -282,7 +283,7 @@ class TunerSpec:
 
 
 def relocate(tuned: TunerSpec, places: Mapping[Path, Path]) -> TunerSpec:
-    """Return a specification with another path of its file.
+    """Return a specification with another path of its plugin file, if it has one.
 
     Args:
         tuned: specification of a tuner.

@@ -23,8 +23,10 @@ from numpy.typing import NDArray
 from bench.benchmark.isolation.cpu_affinity import set_processor
 from bench.benchmark.isolation.isolation_layers import AccessPolicy
 from bench.benchmark.isolation.message_channel import (
+    EVALUATION_SIMULATOR_FLAG,
     MAX_HARNESS_MESSAGE_BYTES,
     MAX_TEXT_BYTES,
+    SIMULATE_FLAG,
     Message,
     MessageChannel,
     PeerClosedError,
@@ -266,14 +268,14 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
             raise GeneratorExit
         # The flags say on which processor to run, see `cpu_affinity.AffinityController`.
         if answer.flags:
-            set_processor(answer.flags - 1)
+            set_processor(answer.flags)
         numbers, point_count = answer.to_array(), answer.size
         used_simulations += point_count
-        proposals = numbers[: point_count * dim].reshape(point_count, dim)
-        losses = numbers[point_count * dim : point_count * dim + point_count]
-        observations = numbers[point_count * dim + point_count :].reshape(
-            point_count, length, channels
-        )
+        losses_start = point_count * dim
+        observations_start = losses_start + point_count
+        proposals = numbers[:losses_start].reshape(point_count, dim)
+        losses = numbers[losses_start:observations_start]
+        observations = numbers[observations_start:].reshape(point_count, length, channels)
         proposals.setflags(write=False)
         losses.setflags(write=False)
         proposal = steps.send(Evaluation(proposals, observations, losses))
@@ -283,6 +285,12 @@ class _RemoteTrainingSimulator:
     """Training simulator of a learned tuner, which simulates on the harness's side of the pipe."""
 
     def __init__(self, channel: MessageChannel, which: int) -> None:
+        """Request the properties of a simulator.
+
+        Args:
+            channel: channel to the harness, which has the simulators.
+            which: 0 for the simulator for training, or `EVALUATION_SIMULATOR_FLAG`.
+        """
         self._channel, self._which = channel, which
         channel.send(b"P", flags=which)
         self._read_properties(channel.receive(MAX_HARNESS_MESSAGE_BYTES))
@@ -296,8 +304,8 @@ class _RemoteTrainingSimulator:
         """
         if answer.kind == b"X":
             refusal = answer.to_document()
-            kinds = {"budget": BudgetExceededError, "value": ValueError}
-            raise kinds.get(refusal["kind"], RuntimeError)(refusal["says"])
+            error_types = {"budget": BudgetExceededError, "value": ValueError}
+            raise error_types.get(refusal["kind"], RuntimeError)(refusal["says"])
         arrays = unpack_arrays(answer.body)
         self.training, self.scale = arrays["training"], arrays["scale"]
         self.dim = self.training.shape[1]
@@ -331,7 +339,7 @@ class _RemoteTrainingSimulator:
         )
         requested = np.array(points, dtype=np.float64).reshape(-1, self.dim)
         request = pack_arrays({"rng": encode_rng_state(rng_state), "points": requested})
-        self._channel.send(b"P", *request, flags=2 + self._which)
+        self._channel.send(b"P", *request, flags=SIMULATE_FLAG | self._which)
         arrays = self._read_properties(self._channel.receive(MAX_HARNESS_MESSAGE_BYTES))
         if is_sendable:
             rng.bit_generator.state = decode_rng_state(arrays["rng"])
@@ -346,7 +354,7 @@ class _RemoteTrainingCallback:
 
     @property
     def ground(self) -> TrainingSimulator:
-        return _RemoteTrainingSimulator(self._channel, 1)
+        return _RemoteTrainingSimulator(self._channel, EVALUATION_SIMULATOR_FLAG)
 
     def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
         self._channel.send_document(b"W", [stage, epoch, epochs, float(loss), float(held_out)])

@@ -8,15 +8,11 @@ from typing import TypeVar
 from bench.benchmark.isolation.process_errors import KilledExternallyError, RunEndedError
 
 Result = TypeVar("Result")
-
-
 MAX_RETRIES = 3
 """Maximum number of attempts at work whose processes are killed externally.
 
 An external kill gives no information about the work itself.
 """
-
-
 NOT_REPRODUCIBLE_REASON = "it was killed, and the repeated training requested other simulations"
 """Reason of a training or run that cannot be repeated."""
 

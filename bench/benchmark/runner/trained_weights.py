@@ -21,12 +21,8 @@ from sims.core.simulator import Array, InputError
 
 _COST_ARRAY = "__simulations_and_seconds__"
 """Name of the array with the cost of the training: simulations and seconds."""
-
-
 _KEY_ARRAY = "__key__"
 """Name of the array with the training key."""
-
-
 RETRAIN_ADVICE = "delete it to train again"
 """Advice for a file that cannot be used; it is never repaired silently."""
 

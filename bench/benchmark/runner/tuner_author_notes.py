@@ -10,8 +10,6 @@ from bench.benchmark.runner.run_in_worker import RunOutcome
 
 SLOW_IMPORTS = 1.0
 """Minimum import time of a run, in seconds, for suggesting one process for several runs."""
-
-
 _MAX_NAMED_FILES = 3
 """Maximum number of file names in a note."""
 

@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.benchmark.isolation.message_channel import (
+    EVALUATION_SIMULATOR_FLAG,
     MAX_STATE_BYTES,
+    SIMULATE_FLAG,
     Message,
     ProtocolError,
     decode_rng_state,
@@ -111,9 +113,9 @@ def _handle_message(
 ) -> None:
     """Answer one message of a tuner during its training.
 
-    Message ``W`` reports progress, and is confirmed by ``K``. Message ``P`` requests simulations;
-    flag 1 selects the simulator for evaluation instead of that for training, which
-    exists only if there is a callback. Flag 2 is read in `_serve_simulation`.
+    Message ``W`` reports progress, and is confirmed by ``K``. Message ``P`` requests simulations.
+    With `EVALUATION_SIMULATOR_FLAG` it uses the simulator for evaluation, which exists only if
+    there is a callback. `SIMULATE_FLAG` is read in `_serve_simulation`.
 
     Args:
         child: process of the tuner.
@@ -125,17 +127,16 @@ def _handle_message(
     Raises:
         ProtocolError: the message is not valid here.
     """
+    # The position of the simulator in the list: 0 for training, 1 for evaluation.
+    which = message.flags & EVALUATION_SIMULATOR_FLAG
+    has_known_flags = message.flags <= EVALUATION_SIMULATOR_FLAG | SIMULATE_FLAG
     if message.kind == b"W" and callback is not None:
         callback.epoch(*_parse_progress(message.to_document()))
         child.send(b"K", deadline=_NO_DEADLINE)
-    elif (
-        message.kind == b"P"
-        and message.flags < 4
-        and (callback is not None or not message.flags & 1)
-    ):
-        if message.flags & 1 and callback is not None and len(simulators) == 1:
+    elif message.kind == b"P" and has_known_flags and (callback is not None or not which):
+        if which and callback is not None and len(simulators) == 1:
             simulators.append(callback.ground)
-        _serve_simulation(child, message, simulators[message.flags & 1])
+        _serve_simulation(child, message, simulators[which])
     else:
         raise ProtocolError("it sent a message of an unexpected kind")
 
@@ -158,10 +159,9 @@ def _serve_simulation(
 ) -> None:
     """Send the properties of a simulator, and simulate if the message requests it.
 
-    It serves a learned tuner that trains in an isolated process. Flag 2 of the message
-    requests a simulation, without which only the properties are sent (message ``O``). A request
-    that is not valid, or beyond the budget, is answered by a refusal (message ``X``), and the
-    training can continue.
+    It serves a learned tuner that trains in an isolated process. Without `SIMULATE_FLAG` only the
+    properties are sent (message ``O``). A request that is not valid, or beyond the budget, is
+    answered by a refusal (message ``X``), and the training can continue.
 
     Args:
         child: isolated process with the tuner.
@@ -169,7 +169,7 @@ def _serve_simulation(
         simulator: training simulator, which counts the simulations.
     """
     arrays: dict[str, NDArray[Any]] = {}
-    if message.flags & 2:
+    if message.flags & SIMULATE_FLAG:
         try:
             arrays = _simulate_points(message, simulator)
         except (ValueError, BudgetExceededError) as error:
