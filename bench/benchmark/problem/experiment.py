@@ -297,7 +297,7 @@ class Experiment:
             raise make_error(subject, "ranges", "one or more, each once", list(self.ranges))
         check_known_names("isolation", [self.isolation], ISOLATION_MODES)
         check_commitment(subject, self.salt, self.salt_sha256)
-        # The range 'real' needs a recording, and the other ranges must not have one.
+        # The range 'real' needs a recording and no other range; other ranges must not have one.
         is_real = "real" in self.ranges
         if is_real != (self.recording is not None) or (is_real and len(self.ranges) != 1):
             raise InputError(f"{subject}: range 'real' and a [recording] go together, and alone")
@@ -337,10 +337,10 @@ class Experiment:
         check_text(subject, "suite", self.suite, max_length=MAX_NAME_LENGTH)
         check_text(subject, "same_targets_as", self.same_targets_as)
         check_text(subject, "model", self.model, max_length=MAX_DESCRIPTION_LENGTH)
-        for word in self.free:
-            check_text(subject, "free", word, max_length=MAX_NAME_LENGTH)
-        for word in self.experiments:
-            check_text(subject, "experiments", word)
+        for parameter_name in self.free:
+            check_text(subject, "free", parameter_name, max_length=MAX_NAME_LENGTH)
+        for experiment_name in self.experiments:
+            check_text(subject, "experiments", experiment_name)
         check_text(subject, "tags", ", ".join(self.tags), max_length=MAX_DESCRIPTION_LENGTH)
         for entry in self.tuners:
             check_text(subject, "tuners: label", entry.label, max_length=MAX_NAME_LENGTH)
@@ -375,9 +375,10 @@ class Experiment:
             ("held_out.initial", held_out_initial),
             ("calibration.initial", calibrated),
         ):
+            # A value is a number, or a range (low, high).
             for name, value in values.items():
-                for end in value if isinstance(value, tuple) else (value,):
-                    check_finite(subject, f"{table_name}.{name}", end)
+                for number in value if isinstance(value, tuple) else (value,):
+                    check_finite(subject, f"{table_name}.{name}", number)
 
     def document(self) -> dict[str, Any]:
         """Return the whole configuration as TOML tables, the inverse of `parse_experiment`.
@@ -483,6 +484,7 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     tuners = parse_entries(path, document.get("tuners", {}))
     entries = {key: value for key, value in document.items() if key != "tuners"}
     fields = check_entries(path, "", entries, hints)
+    # The simulator is a robot's model file, or a registered one, or those of named experiments.
     if model := fields.get("model"):
         fields["model"] = resolve_model_path(model, path)
         fields.setdefault("simulator", check_name(Path(model).stem))
@@ -509,7 +511,8 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     _expand_combinations(experiment, path)  # an error in a swept value is an error of this file
-    # The stored configuration of a result may select some of the questions.
+    # A suite of diagnoser questions states the hash of all of them. The stored configuration of a
+    # result states none, because it may select some of the questions.
     if experiment.suite and experiment.diagnosis and experiment.problem_hashes:
         question_hash = compute_hash(
             {k: document["diagnosis"].get(k) for k in ("seed", "questions")}

@@ -102,7 +102,11 @@ def _parse_list_item(path: Path, key: str, item: Any) -> TunerEntry:
 def _parse_tuner_table(path: Path, entry_key: str, label: str, value: Any) -> TunerEntry:
     """Parse the table of one tuner; a table without the key ``tuner`` uses its label as the name.
 
-    `path` and `entry_key` (file and key) are for error messages, `value` is the table.
+    Args:
+        path: path of the experiment file, for messages.
+        entry_key: key of the table in the file, for messages.
+        label: label under which results are listed.
+        value: the table.
     """
     hints = {key: hint for key, hint in get_type_hints_of(TunerEntry).items() if key != "label"}
     table = check_entries(path, entry_key, value, hints)
@@ -265,6 +269,7 @@ def _list_referenced_files(path: Path, tables: Mapping[str, Any]) -> Iterator[Pa
     recording = str(tables.get("recording", {}).get("path", ""))
     if recording and (path.parent / recording).is_file():
         yield path.parent / recording
+        # The description of a recording is next to its table.
         yield (path.parent / recording).with_suffix(".toml")
 
 

@@ -41,18 +41,11 @@ def availability(experiment: Experiment) -> Availability:
     if experiment.experiments:
         return _combine_availability(experiment)
     data_set = _find_missing_data_set(experiment)
-    missing_file = (
-        ""
-        if data_set
-        else find_missing_model_file(experiment) or _explain_missing_recording(experiment)
-    )
-    return Availability(
-        data_set,
-        missing_file
-        or _explain_missing_simulator(experiment)
-        or _explain_missing_engine(experiment),
-        _explain_missing_tuners(experiment),
-    )
+    reason = ""
+    if data_set is None:
+        reason = find_missing_model_file(experiment) or _explain_missing_recording(experiment)
+    reason = reason or _explain_missing_simulator(experiment) or _explain_missing_engine(experiment)
+    return Availability(data_set, reason, _explain_missing_tuners(experiment))
 
 
 def leave_out_missing_problems(suite: Experiment) -> tuple[Experiment, dict[str, str]]:
@@ -95,31 +88,22 @@ def _combine_availability(experiment: Experiment) -> Availability:
     Args:
         experiment: Sweep or suite that names other experiments.
     """
-    availability_by_name = {
-        part_experiment.name: availability(part_experiment)
-        for part_experiment in expand_sweep(experiment)
-    }
+    missing_by_name = {part.name: availability(part) for part in expand_sweep(experiment)}
     runnable = {
-        n: member_availability
-        for n, member_availability in availability_by_name.items()
-        if not (member_availability.data_set or member_availability.skipped)
+        name: missing
+        for name, missing in missing_by_name.items()
+        if not (missing.data_set or missing.skipped)
     }
     if experiment.suite and runnable:
-        availability_by_name = runnable
-    data_sets = [
-        member_availability.data_set
-        for member_availability in availability_by_name.values()
-        if member_availability.data_set
-    ]
+        missing_by_name = runnable
+    data_sets = [missing.data_set for missing in missing_by_name.values() if missing.data_set]
     skipped = [
-        f"{name} {member_availability.skipped}"
-        for name, member_availability in availability_by_name.items()
-        if member_availability.skipped
+        f"{name} {missing.skipped}" for name, missing in missing_by_name.items() if missing.skipped
     ]
     missing_tuners = {
         label: reason
-        for member_availability in availability_by_name.values()
-        for label, reason in member_availability.tuners.items()
+        for missing in missing_by_name.values()
+        for label, reason in missing.tuners.items()
     }
     return Availability(next(iter(data_sets), None), "; ".join(skipped), missing_tuners)
 
@@ -127,7 +111,8 @@ def _combine_availability(experiment: Experiment) -> Availability:
 def _explain_missing_simulator(experiment: Experiment) -> str:
     """Return why the experiment's registered simulator cannot be used here.
 
-    The text is empty if it can be used, or if the simulator is not a registered one.
+    The text is empty if it can be used, or if the simulator is not a registered one: a robot's
+    model file is checked elsewhere, and an unknown name is an error of the file.
     """
     if experiment.model or experiment.simulator not in simulators.names():
         return ""

@@ -64,10 +64,10 @@ def load_recorded_runs(path: str, simulator: Simulator) -> RecordedRuns:
 def _make_observed_runs(
     recording: Recording, runs: tuple[Run, ...], simulator: Simulator
 ) -> ObservedRuns:
-    """Convert runs of a recording to scenarios and observations, for one side: fitting or held out.
+    """Convert the fitted or the held-out runs of a recording to scenarios and observations.
 
-    The observations of all runs are stacked to (T, C): T samples of all runs together, C channels
-    in the order of the simulator.
+    The observations of all runs are concatenated to (T, C): T samples of all runs together, C
+    channels in the order of the simulator.
     """
     names = [channel.name for channel in simulator.channels]
     observed = [np.stack([run.channels[name] for name in names], axis=1) for run in runs]
@@ -95,12 +95,12 @@ def make_scenario(run: Run, simulator: Simulator, constants: Mapping[str, float]
         if name in simulator.states and np.isfinite(value)
     }
     return Scenario(
-        run.times,
-        {**start, **run.initial},
-        run.inputs,
-        {**constants, **run.constants},
-        run.linear,
-        run.offset,
+        times=run.times,
+        initial={**start, **run.initial},
+        inputs=run.inputs,
+        constants={**constants, **run.constants},
+        linear=run.linear,
+        offset=run.offset,
         off=run.off,
     )
 

@@ -33,8 +33,8 @@ PACKAGE_SCHEME = "package://"
 def get_simulator_class(experiment: Experiment) -> type[Simulator]:
     """Return the class of the simulator that an experiment tunes, registered or of a model file.
 
-    Of a robot, the recording may state actuators, engine and numbers to tune; the experiment's own
-    entries precede them.
+    For a robot, the recording may state actuators, an engine and the numbers to tune. The
+    experiment's own actuators and numbers have priority over those of the recording.
 
     Raises:
         InputError: there is no simulator of that name, or its model file cannot be used.
@@ -57,9 +57,10 @@ def get_simulator_class(experiment: Experiment) -> type[Simulator]:
 
 
 def complete_robot_experiment(experiment: Experiment) -> Experiment:
-    """Complete a robot experiment that does not specify channels, commands and initial pose.
+    """Complete a robot experiment that does not specify channels, inputs and initial pose.
 
-    They are taken from its recording, or from the robot's default recording.
+    The channels are those of its recording if it has one. Otherwise channels, initial pose and
+    inputs are those of the default recording that the robot's system declares.
     """
     if not experiment.model:
         return experiment
@@ -73,8 +74,8 @@ def complete_robot_experiment(experiment: Experiment) -> Experiment:
         changes["observe"] = default_recording.observe
         changes["initial"] = dict(default_recording.initial)
         changes["inputs"] = dict(default_recording.inputs)
-    left_out = {key: value for key, value in changes.items() if not getattr(experiment, key)}
-    return experiment.chosen(**left_out)
+    unspecified = {key: value for key, value in changes.items() if not getattr(experiment, key)}
+    return experiment.chosen(**unspecified)
 
 
 def find_missing_model_file(experiment: Experiment) -> str:

@@ -166,6 +166,7 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
         number: 0 for the first draw; counts the repeated draws, each from new streams.
     """
     # The stream's name contains no tuner, seed or budget, so that all tuners get the same target.
+    # Start, true parameters, scenario and noise have a stream each.
     experiment_name = problem.experiment.same_targets_as or problem.experiment.name
     redraw_names = ("redraw", number) if number else ()
     streams = TargetStreams(problem.salt, experiment_name, kind, index, *redraw_names)
@@ -178,9 +179,8 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     recording = problem.recording
     if recording:
         return Target(BlindedTarget(name, kind, start, recording.fitting, recording.held_out), None)
-    scenarios = problem.draw_scenarios(
-        streams.get_stream("scenario")
-    )  # one scenario, because only recordings have several runs
+    # This is one scenario, because only recordings have several runs.
+    scenarios = problem.draw_scenarios(streams.get_stream("scenario"))
     # The parameters of `world` are the first of the tuned ones.
     theta = problem.cube.to_physical(truth[None])[:, : len(problem.world.parameters)]
     noise_free = problem.world.simulate(theta, scenarios[0])[0]
@@ -191,8 +191,8 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     held_out = _simulate_held_out(problem, theta, streams)
     if any(_is_divergent(y, problem.channels) for y in (noise_free, held_out.observed)):
         return None
-    sealed = BlindedTarget(name, kind, start, fitting, held_out)
-    return Target(sealed, problem.cube.to_physical(truth), number)
+    blinded = BlindedTarget(name, kind, start, fitting, held_out)
+    return Target(blinded, problem.cube.to_physical(truth), redraws=number)
 
 
 def _round_to_resolution(observed: Array, problem: TargetProblem) -> Array:
@@ -213,15 +213,13 @@ def _round_to_resolution(observed: Array, problem: TargetProblem) -> Array:
 
 
 def _is_divergent(observed: Array, channels: Sequence[Channel]) -> bool:
-    """Return whether a simulation (T, C) failed.
+    """Return whether a simulation failed.
 
-    It failed if a sample is infinite or beyond `DIVERGENCE_LIMIT`, or if a channel has no sample.
-    Single missing samples (NaN), as of a camera, are not a failure.
-
-    Shapes: T samples, C channels.
+    It failed if a sample is infinite or beyond `DIVERGENCE_LIMIT` times the scale of its channel,
+    or if a channel has no sample. Single missing samples (NaN), as of a camera, are not a failure.
 
     Args:
-        observed: (T, C) simulated channels.
+        observed: (T, C) simulated samples of C channels; T is 0 without held-out scenarios.
         channels: the channels, with their scales.
     """
     if not len(observed):

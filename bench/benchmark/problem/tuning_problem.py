@@ -152,11 +152,16 @@ class TuningProblem:
             )
 
     def _check_constants(self) -> None:
-        """Raise an error for random constants that the simulator does not have or accept."""
+        """Raise an error for random constants that the simulator does not have or accept.
+
+        The simulator checks the constants of a scenario: first all lower ends of the ranges from
+        which constants are drawn, then all upper ends.
+        """
         constants = self.experiment.constants.items()
         ranges = {name: limits for name, limits in constants if isinstance(limits, tuple)}
-        for end in range(2):
-            extreme_values = {name: limits[end] for name, limits in ranges.items()}
+        lower_ends = {name: low for name, (low, _) in ranges.items()}
+        upper_ends = {name: high for name, (_, high) in ranges.items()}
+        for extreme_values in (lower_ends, upper_ends):
             self.simulator.run_constants(Scenario(np.zeros(1), constants=extreme_values))
 
     def close(self) -> None:
@@ -257,6 +262,7 @@ class TuningProblem:
         Returns:
             The spectrum; None if it is not requested or computed for another start.
         """
+        # The name of the first start ends in 000.
         is_repeated = target.truth is None and target.blinded.name != f"{target.blinded.range}-000"
         if is_repeated or not self.has_several_parameters:
             return None
@@ -271,9 +277,10 @@ class TuningProblem:
         return compute_spectrum(simulate, evaluation_point, self.cube.parameters, self.scale)
 
     def compute_distance_from_training(self, truth: Array) -> float:
-        """Return the distance of true parameters (dim,) from the training range.
+        """Return the distance of true parameters from the training range.
 
-        It is the largest distance of a parameter in units of the training-range width; 0 inside.
+        It is the largest distance of any parameter, in units of the width of the parameter's
+        training range; 0 inside.
 
         Args:
             truth: (dim,) true parameters in their physical units.

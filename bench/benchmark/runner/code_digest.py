@@ -266,11 +266,12 @@ def _is_defined_in_module(kind: type) -> bool:
 
 
 def _represent_class(kind: type) -> Any:
-    """Return what represents a class in a hash: its digest, nothing, or its source.
+    """Return what represents a class in a hash.
 
-    A class that is made at run time has an attribute ``source_digest``. A class of this project's
-    source folders is represented by "", because `hash_source_folders` covers it. For any other
-    class, it is the source of the notebook cell, plugin file or package that defines it.
+    * A class that is made at run time: its attribute ``source_digest``.
+    * A class of a notebook or of the main script: its source.
+    * A class of this project's source folders: "", because `hash_source_folders` covers it.
+    * Any other class: the content of the plugin file or package that defines it.
 
     Raises:
         InputError: the source of the class cannot be found.
@@ -312,11 +313,20 @@ def _read_class_source(kind: type) -> str:
 
 
 def _read_package_contents(kind: type, path: Path) -> Any:
-    """Return the contents of an installed plugin's package, or of the file with the class."""
-    top = sys.modules.get(_get_top_level_package(kind))
-    if _get_top_level_package(kind) in _list_plugin_packages() and (
-        folders := getattr(top, "__path__", None)
-    ):
+    """Return the contents of an installed plugin's package, or else of the file with the class.
+
+    Args:
+        kind: class to be hashed.
+        path: file that defines the class.
+
+    Returns:
+        For a package, a list of (relative path, content) for each of its folders; for a file, its
+        name and content.
+    """
+    package = _get_top_level_package(kind)
+    # A module without a package has no `__path__`.
+    folders = getattr(sys.modules.get(package), "__path__", None)
+    if folders and package in _list_plugin_packages():
         return [_read_source_files(Path(folder), Path(folder)) for folder in folders]
     return path.name, path.read_bytes()
 

@@ -56,7 +56,7 @@ _TYPICAL_SIZES: Mapping[str, float] = {
 """Typical sizes of experiments."""
 
 
-class _Experiment:
+class _ExperimentSizes:
     """Sizes of an experiment from which its needs are computed."""
 
     def __init__(self, experiment: Experiment) -> None:
@@ -162,31 +162,31 @@ def estimate_comparison_need(
         jobs: number of worker processes; 0 for none.
         cluster: True if a cluster executes the runs.
     """
-    quantities = _Experiment(experiment)
+    sizes = _ExperimentSizes(experiment)
     # For a bounce shot this counts its shots with one ball; it has only a few balls.
     targets = experiment.targets * len(experiment.ranges)
     seeds_and_budgets = [
-        (count_seeds(experiment, e), e.budget or experiment.budget) for e in quantities.tuners
+        (count_seeds(experiment, e), e.budget or experiment.budget) for e in sizes.tuners
     ]
     runs = targets * sum(seeds for seeds, _ in seeds_and_budgets)
     simulations = targets * sum(seeds * budget for seeds, budget in seeds_and_budgets)
     row_count = runs + simulations
     held_out = experiment.held_out.scenarios if experiment.held_out else 0
     max_budget = max((budget for _, budget in seeds_and_budgets), default=0)
-    training_simulations = experiment.training_budget if quantities.learned else 0
+    training_simulations = experiment.training_budget if sizes.learned else 0
     workers = _MAX_CLUSTER_WORKERS if cluster else max(jobs, 1)
     memory = (
         runs * _RUN_MEMORY
-        + targets * (1 + held_out) * quantities.observation
+        + targets * (1 + held_out) * sizes.observation
         + row_count * _ROW_MEMORY
         + (0 if cluster else jobs * _WORKER_BYTES)
-        + max_budget * (quantities.dim + 1) * BYTES_PER_NUMBER
-        + training_simulations * quantities.observation
-        + quantities.steps * BYTES_PER_STEP
+        + max_budget * (sizes.dim + 1) * BYTES_PER_NUMBER
+        + training_simulations * sizes.observation
+        + sizes.steps * BYTES_PER_STEP
     )
     seconds = (
-        simulations * quantities.simulation * (1 + held_out) / workers
-        + training_simulations * quantities.simulation
+        simulations * sizes.simulation * (1 + held_out) / workers
+        + training_simulations * sizes.simulation
         + row_count * _ROW_SECONDS
         + runs * _RUN_SECONDS
     )
@@ -196,8 +196,8 @@ def estimate_comparison_need(
         "budget": max_budget,
         "training_budget": training_simulations,
         "held_out.scenarios": held_out,
-        "sampling.samples": quantities.samples,
-        "steps": quantities.steps,
+        "sampling.samples": sizes.samples,
+        "steps": sizes.steps,
         "jobs": jobs,
     }
     counts_text = ", ".join(f"{name} {count:.4g}" for name, count in counts.items() if count)
@@ -206,7 +206,7 @@ def estimate_comparison_need(
         _suggest_reduction(counts),
         memory=memory,
         disk=row_count * _ROW_DISK,
-        steps=quantities.steps,
+        steps=sizes.steps,
         seconds=seconds,
     )
 
@@ -233,7 +233,7 @@ def check_training_size(
     Raises:
         InputError: the trainings need more than is available.
     """
-    sizes = _Experiment(experiment)
+    sizes = _ExperimentSizes(experiment)
     budget = experiment.training_budget
     need = ResourceNeed(
         f"{seeds} trainings of {entry.label} with {budget} simulations, each of {sizes.samples}"

@@ -15,6 +15,7 @@ import logging
 import multiprocessing
 import tempfile
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -184,25 +185,17 @@ class ClusterPool:
         """
         from distributed import CancelledError, KilledWorker
 
+        # Index of each submitted call by its future.
         waiting: dict[Any, int] = {}
-        # The number of workers that each call has lost, and the calls to be executed again.
+        # Indices of the calls to be submitted; calls that are submitted again come first.
+        pending = deque(range(len(calls)))
+        # Number of workers that each call has lost, by index of the call.
         lost_workers: dict[int, int] = {}
-        new_indices = iter(range(len(calls)))
-        repeated_indices: list[int] = []
         try:
             while True:
-                max_queued = _QUEUED_CALLS_PER_THREAD * max(
-                    sum(self._client.nthreads().values()), 1
-                )
-                while (
-                    len(waiting) < max_queued
-                    and (
-                        index := repeated_indices.pop()
-                        if repeated_indices
-                        else next(new_indices, None)
-                    )
-                    is not None
-                ):
+                thread_count = max(sum(self._client.nthreads().values()), 1)
+                while pending and len(waiting) < _QUEUED_CALLS_PER_THREAD * thread_count:
+                    index = pending.popleft()
                     waiting[self._submit_call(calls[index], seconds)] = index
                 if not waiting:
                     return
@@ -219,7 +212,7 @@ class ClusterPool:
                                 f"cluster {self.address}: lost {_MAX_LOST_WORKERS_PER_CALL} "
                                 "workers on one run"
                             )
-                        repeated_indices.append(index)
+                        pending.appendleft(index)
                         continue
                     result = error if error is not None else self._receive_result(future.result())
                     # The cluster stores a result until its future is released.
@@ -267,8 +260,8 @@ class ClusterPool:
         of the call.
         """
         function, arguments = call
-        travelling = [argument for argument in arguments if isinstance(argument, Transferable)]
-        paths = [path for argument in travelling for path in argument.list_files()]
+        transferable = [argument for argument in arguments if isinstance(argument, Transferable)]
+        paths = [path for argument in transferable for path in argument.list_files()]
         contents = [self._send_file(path) for path in paths]
         return self._client.submit(
             run_on_worker, function, arguments, seconds, self._plugins, paths, contents, pure=False

@@ -211,12 +211,12 @@ def _iterate_planned_runs(
     experiment: Experiment, entries: list[TunerEntry], targets: list[Target]
 ) -> Iterator[PlannedRun]:
     """Iterate over all runs, target by target, so that the remaining time can be estimated."""
-    name = RunIds(experiment).make_run_id
+    make_run_id = RunIds(experiment).make_run_id
     for target in targets:
         for entry in entries:
             budget = entry.budget or experiment.budget
             for seed in range(count_seeds(experiment, entry)):
-                run = name(entry, target.blinded, seed, budget)
+                run = make_run_id(entry, target.blinded, seed, budget)
                 yield PlannedRun(RunRequest(run, entry, seed, target.blinded, budget), target)
 
 
@@ -257,9 +257,9 @@ def run_experiment(
             failures = _train_learned_entries(workers, results, progress)
             ready = _store_untrained_runs(results, failures, progress)
             # Each outcome is stored before the next one, so that a kill loses running calls only.
-            calls = _LazyCalls(results, ready.places)
+            calls = _LazyCalls(results, ready.plan_indices)
             for i, outcome in workers.iterate_results(calls, experiment.timeout):
-                _store_result(results, ready.places[i], outcome)
+                _store_result(results, ready.plan_indices[i], outcome)
                 ready.step()
         except KeyboardInterrupt:
             results.interrupted = True
@@ -268,9 +268,9 @@ def run_experiment(
 
 
 class _ReadyRuns(NamedTuple):
-    """Places in the plan of runs that can be executed, and the callback after each of them."""
+    """Indices in the plan of runs that can be executed, and the callback after each of them."""
 
-    places: list[int]
+    plan_indices: list[int]
     step: Callable[[], None]
 
 
@@ -293,10 +293,10 @@ def _store_untrained_runs(
     ]
     ready = _ReadyRuns([], progress("running", len(missing)))
     for index in missing:
-        order = results.plan[index].request
-        failure = failures.get((order.entry.label, order.seed))
+        request = results.plan[index].request
+        failure = failures.get((request.entry.label, request.seed))
         if failure is None:
-            ready.places.append(index)
+            ready.plan_indices.append(index)
         else:
             _store_result(results, index, failure)
             ready.step()
@@ -328,16 +328,16 @@ def _compute_target_spectra(results: ExperimentRun, progress: ProgressFactory) -
 
 
 class _LazyCalls(Sequence[Call]):
-    """Lazy sequence of calls for places of the plan.
+    """Lazy sequence of the calls that execute runs of the plan.
 
     Each call is created when it is accessed, because a million calls would fill the memory.
     """
 
-    def __init__(self, results: ExperimentRun, places: list[int]) -> None:
-        self._results, self._places = results, places
+    def __init__(self, results: ExperimentRun, plan_indices: list[int]) -> None:
+        self._results, self._plan_indices = results, plan_indices
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._plan_indices)
 
     def __getitem__(self, i: Any) -> Any:
         """Return the call that executes the planned run number `i` of those still to be run.
@@ -346,15 +346,15 @@ class _LazyCalls(Sequence[Call]):
         the tuner in isolation, the folders it must not see, and the file of its trained weights.
         """
         results = self._results
-        order = results.plan[self._places[i]].request
-        order = replace(
-            order, tuned=results.tuned.get(order.entry.label), hidden=results.hidden_paths
+        request = results.plan[self._plan_indices[i]].request
+        request = replace(
+            request, tuned=results.tuned.get(request.entry.label), hidden=results.hidden_paths
         )
         # The plan was made before the training; run ids do not depend on the location of weights.
-        training = results.trainings.get((order.entry.label, order.seed))
+        training = results.trainings.get((request.entry.label, request.seed))
         if training is not None:
-            order = replace(order, weights=training.path)
-        return execute_run, (results.problem.experiment, order)
+            request = replace(request, weights=training.path)
+        return execute_run, (results.problem.experiment, request)
 
 
 def _train_learned_entries(

@@ -143,7 +143,7 @@ def load_plugins_for_experiment(paths: Sequence[str], experiment: Experiment) ->
 
 
 def list_compared_parts(experiment: Experiment) -> list[tuple[Registry[Any], str]]:
-    """List the tuners or diagnosers of an experiment, each with its registry."""
+    """List the tuners or diagnosers that an experiment compares: registry and registered name."""
     names = [(tuners, entry.tuner) for entry in experiment.tuners]
     return [*names, *((diagnosers, name) for name in experiment.diagnosis.get("diagnosers", ()))]
 
@@ -246,8 +246,9 @@ def _make_untrusted_code_error(label: str, file: object) -> InputError:
 def describe_plugins(paths: Sequence[str], experiment: Experiment) -> list[Plugin]:
     """Return what other processes need to know of plugin files and of installed tuners.
 
-    If tuners are not trusted, these are the results of their inspection, so that workers do not
-    load code of tuners either. A file that was not inspected yet is inspected now.
+    If tuners are trusted, other processes load all files. Otherwise the result has descriptions of
+    their tuners or diagnosers from the inspection, so that workers do not load this code either. A
+    file that was not inspected yet is inspected now.
 
     Raises:
         InputError: a file cannot be used.
@@ -273,9 +274,10 @@ def announce_installed(parts: Iterable[tuple[Registry[Any], str]]) -> None:
     """Inspect tuners and diagnosers of other packages before they are imported in this process.
 
     Their code must not run here, so a stub with the properties found is registered in their place.
+    Those that are already registered here, belong to this project or cannot be used are left alone.
 
     Args:
-        parts: registries and names of the parts.
+        parts: registry and registered name of each tuner or diagnoser.
     """
     for registry, name in parts:
         if is_external_part(name, registry):
@@ -305,8 +307,10 @@ def must_build_isolated(entry: TunerEntry) -> bool:
         retry_if_killed(lambda: _try_to_build(entry))
         return True
     except RunEndedError as ended:
+        # The last line of a traceback has the error: its class and its message.
         message = "".join(str(ended).strip().splitlines()[-1:])
         error_name, _, explanation = message.partition(": ")
+        # Options that a tuner refuses raise these errors, whose message alone is clear.
         message = explanation if error_name in ("TypeError", "ValueError") else message
         raise InputError(f"tuner {entry.label}: {message}") from None
 
@@ -321,6 +325,10 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
 
     A file is loaded if it defines a simulator or effect that is needed. Its names must not be in
     use, which is checked before its code runs.
+
+    Args:
+        paths: plugin files.
+        needed: names of the simulators and effects that this process needs.
 
     Raises:
         InputError: a file cannot be used.
@@ -352,10 +360,10 @@ def _check_name_free(
     This is checked before the file's code is loaded, because the description may be wrong.
 
     Args:
-        kind: kind of the part, such as ``tuner``.
-        name: its name.
+        kind: kind of the class, such as ``tuner``.
+        name: its registered name.
         path: path of the plugin file.
-        paths_by_name: file of each described part by kind and name, extended in place.
+        paths_by_name: file of each described class by kind and name, extended in place.
 
     Raises:
         InputError: the name is in use.
@@ -392,18 +400,24 @@ def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
 
 
 def is_external_part(name: str, registry: Registry[Any] = tuners) -> bool:
-    """Return whether a registered part belongs to another package and is not loaded here."""
+    """Return whether a tuner or diagnoser belongs to another package and is not loaded here.
+
+    Args:
+        name: registered name.
+        registry: registry of tuners or of diagnosers.
+    """
+    # The entry point is the address of its class in an installed package, such as `module:Class`.
     entry_point = registry.entry(name)
     is_registered = registry.place(name) is not None or entry_point is None
     return not is_registered and not str(entry_point).startswith(_PROJECT_PACKAGES)
 
 
 def _ask_isolated_process(question: dict[str, str], label: str) -> list[dict[str, Any]]:
-    """Return the answer of an isolated process that has loaded the given plugin.
+    """Return the descriptions by an isolated process that has loaded the given plugin.
 
     Args:
-        question: what to load: ``file`` is the path of a plugin file, empty for an installed
-            plugin.
+        question: what to load: ``file`` is the path of a plugin file; if it is empty, ``kind`` and
+            ``name`` are those of an installed tuner or diagnoser.
         label: name of the plugin in error messages.
 
     Returns:
@@ -445,17 +459,17 @@ def _request_inspection(question: dict[str, str], files: list[str]) -> Any:
 
 
 def _validate_part(part: Any, file: str) -> dict[str, Any]:
-    """Validate one element of an answer about a plugin, and convert it to plain values.
+    """Validate the description of one tuner, diagnoser, simulator or effect of a plugin.
 
-    Code of the plugin may have written the answer, so nothing in it is trusted: texts are shortened
-    and printable, and the hash of the source includes the content of the file.
+    Code of the plugin may have written the description, so nothing in it is trusted: texts are
+    shortened and made printable, and the hash of the source includes the content of the file.
 
     Args:
-        part: one element of the answer.
+        part: description from the isolated process, any JSON value.
         file: path of the plugin file; empty for an installed plugin.
 
     Raises:
-        InputError: the element does not describe a part.
+        InputError: it is not the description of a registered class.
     """
     kinds = [registry.kind for registry in REGISTRIES]
     if not isinstance(part, dict) or part.get("kind") not in kinds or "name" not in part:
@@ -545,7 +559,8 @@ def _describe_class(kind: str, part: Any) -> dict[str, Any]:
             "learned": part.learned,
             "trains_as": getattr(part, "trains_as", ""),
             "source": hash_class_source(part),
-            # A package may be missing for the part although its file can be imported.
+            # `get` raises an error if a package is missing that the class needs, although its file
+            # can be imported.
             "name": _ISOLATED_REGISTRIES[kind].get(part.name).name,
         }
     except PartUnavailableError as error:

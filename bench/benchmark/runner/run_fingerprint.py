@@ -82,7 +82,11 @@ def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[
 
 
 def _get_source_folders(experiment: Experiment) -> tuple[str, ...]:
-    """Return the source folders that determine the results, if more than those of a comparison."""
+    """Return the source folders that determine the results of an experiment.
+
+    The result is empty for an ordinary comparison of tuners, whose folders are the default of
+    `hash_source_folders`.
+    """
     if experiment.shot:
         return BOUNCE_SHOT_SOURCE_FOLDERS
     if experiment.diagnosis:
@@ -229,9 +233,9 @@ def _hash_target(target: BlindedTarget) -> str:
     run_sets = [target.fitting, target.held_out]
     scenarios = [
         [s.times.tobytes(), s.initial, {k: v.tobytes() for k, v in s.inputs.items()}, s.constants]
-        for side in run_sets
-        for s in side.scenarios
+        for run_set in run_sets
+        for s in run_set.scenarios
     ]
     return compute_digest(
-        scenarios, [side.observed.tobytes() for side in run_sets], target.start.tobytes()
+        scenarios, [run_set.observed.tobytes() for run_set in run_sets], target.start.tobytes()
     )

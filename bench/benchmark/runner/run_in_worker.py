@@ -166,8 +166,8 @@ def _execute_once(
         lengths=tuple(s.times.size for s in target.fitting.scenarios),
         scene=problem.describe_scenarios(target.fitting.scenarios),
     )
-    # Simulations of the scoring and of earlier runs are not counted.
-    simulated = problem.simulated
+    # The problem also counts simulations of the scoring and of earlier runs.
+    simulated_before = problem.simulated
     started = perf_counter()
     written, import_seconds = NOTHING_WRITTEN, 0.0
     if request.tuned is None:
@@ -182,7 +182,7 @@ def _execute_once(
 
         trace, written, import_seconds = _run_isolated(experiment, request, task, evaluate)
     seconds = perf_counter() - started
-    hidden_simulations = problem.simulated - simulated - len(trace.losses)
+    hidden_simulations = problem.simulated - simulated_before - len(trace.losses)
     # A simulator that raises an error has counted simulations without a result.
     if hidden_simulations > 0 and trace.status != "crashed":
         raise HiddenSimulationError(f"{hidden_simulations} simulations outside the budget")
@@ -192,6 +192,7 @@ def _execute_once(
     # Held-out runs are simulated after the run, so that the tuner cannot see them.
     heldout = None
     if target.held_out.scenarios:
+        # The evaluator has no points yet, so it simulates all recommendations.
         heldout = ProposalEvaluator(problem, target.held_out).compute_rmse(
             trace.proposals[:0], trace.recommendations
         )

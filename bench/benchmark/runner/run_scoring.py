@@ -26,15 +26,15 @@ def make_unfinished_outcome(
     return RunOutcome(trace, obs_rmse=unknown_errors, heldout_rmse=None, seconds=0.0)
 
 
-def make_status(problem: TuningProblem, order: RunRequest, outcome: RunOutcome) -> RunStatus:
+def make_status(problem: TuningProblem, request: RunRequest, outcome: RunOutcome) -> RunStatus:
     """Make the status row of a run."""
     trace = outcome.trace
     return RunStatus(
-        run=order.run,
-        tuner=order.entry.label,
+        run=request.run,
+        tuner=request.entry.label,
         simulator=problem.experiment.simulator,
-        target=order.target.name,
-        seed=order.seed,
+        target=request.target.name,
+        seed=request.seed,
         status=trace.status,
         reason=trace.reason,
         simulations=len(trace.losses),
@@ -45,7 +45,7 @@ def make_status(problem: TuningProblem, order: RunRequest, outcome: RunOutcome) 
 
 def build_rows(
     problem: TuningProblem,
-    order: RunRequest,
+    request: RunRequest,
     target: Target,
     outcome: RunOutcome,
     spectrum: InformationSpectrum | None = None,
@@ -59,7 +59,7 @@ def build_rows(
 
     Args:
         problem: tuning problem.
-        order: request of the run.
+        request: request of the run.
         target: target with its true parameters.
         outcome: outcome of the run.
         spectrum: Fisher-information spectrum of the target; if given, parameter errors along stiff
@@ -71,12 +71,12 @@ def build_rows(
     trace = outcome.trace
     simulations = len(trace.losses)
     columns: dict[str, Any] = {
-        "run": [order.run] * (simulations + 1),
+        "run": [request.run] * (simulations + 1),
         "experiment": [problem.experiment.name] * (simulations + 1),
-        "tuner": [order.entry.label] * (simulations + 1),
+        "tuner": [request.entry.label] * (simulations + 1),
         "simulator": [problem.experiment.simulator] * (simulations + 1),
         "target": [target.blinded.name] * (simulations + 1),
-        "seed": [order.seed] * (simulations + 1),
+        "seed": [request.seed] * (simulations + 1),
         "range": [target.blinded.range] * (simulations + 1),
         "trusted": [problem.experiment.trusted] * (simulations + 1),
         "k": np.arange(simulations + 1),

@@ -154,7 +154,7 @@ class Study(ABC):
         """Return how far the study came; reveal its salt if it is complete.
 
         Args:
-            why: reason for which it ended early, a field of `StudyOutcome`.
+            why: reason for which it ended early: `interrupted` or `stopped` of `StudyOutcome`.
         """
         ends = self.list_run_ends()
         missing = sum(end.status == MISSING_STATUS for end in ends)

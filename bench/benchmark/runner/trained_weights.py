@@ -69,7 +69,7 @@ def write_weights(
     Raises:
         RunEndedError: an array has a name that is reserved.
     """
-    # These names are arguments of `np.savez` or reserved in the file.
+    # `file` and `allow_pickle` are arguments of `np.savez`; the others are written below.
     reserved = {"file", "allow_pickle", _COST_ARRAY, _KEY_ARRAY} & set(state)
     if reserved:
         raise RunEndedError(

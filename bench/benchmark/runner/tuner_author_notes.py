@@ -15,8 +15,15 @@ _MAX_NAMED_FILES = 3
 
 
 @dataclass
-class _OfTuner:
-    """Information about the runs of one tuner."""
+class _TunerRuns:
+    """Information about the runs of one tuner.
+
+    Attributes:
+        files: number of files that it wrote, and that were discarded.
+        names: names of the first files, as keys.
+        unnamed: True if there were further files without a name here.
+        import_seconds: time for imports before each run that needed any, in seconds.
+    """
 
     files: int = 0
     names: dict[str, None] = field(default_factory=dict)
@@ -33,7 +40,7 @@ class Notes:
     """
 
     isolation: str
-    _tuners: dict[str, _OfTuner] = field(default_factory=lambda: defaultdict(_OfTuner))
+    _tuners: dict[str, _TunerRuns] = field(default_factory=lambda: defaultdict(_TunerRuns))
 
     def add(self, label: str, outcome: RunOutcome) -> None:
         """Add the information of one run.

@@ -78,12 +78,10 @@ class _DivergenceError(Exception):
 def _check_proposals(proposed: object, dim: int, label: str) -> Array:
     """Return proposals as a new (n, dim) array, clipped to the unit cube.
 
-    `label` names them in messages: "proposals" or "recommendations".
-
     Args:
         proposed: Object that the tuner yielded.
         dim: Number of parameters.
-        label: What the points are, for messages.
+        label: What the points are, for messages: "proposals" or "recommendations".
 
     Raises:
         _DivergenceError: a point is not finite.
@@ -156,7 +154,7 @@ class _RunRecord:
                 self._best_loss, self._best = loss, points[i]
             self._recommended.append(self._recommended[-1] if stays else self._best)
 
-    def time(self, points: int, tuner: float, simulator: float) -> None:
+    def add_seconds(self, points: int, tuner: float, simulator: float) -> None:
         """Add the seconds spent on a batch of points.
 
         Args:
@@ -167,13 +165,13 @@ class _RunRecord:
         self._tuner_seconds.append((points, tuner))
         self._simulator_seconds.append((points, simulator))
 
-    def late(self, tuner: float) -> None:
+    def add_late_seconds(self, tuner: float) -> None:
         """Add the seconds in the tuner after the last simulation to those of the last batch."""
         if self._tuner_seconds:
             points, seconds = self._tuner_seconds[-1]
             self._tuner_seconds[-1] = points, seconds + tuner
 
-    def trace(self, status: str, reason: str) -> RunTrace:
+    def make_trace(self, status: str, reason: str) -> RunTrace:
         """Return the trace of the ended run."""
         return RunTrace(
             status,
@@ -241,7 +239,7 @@ def drive_tuner(
     elif status in ("done", "converged") and record.diverged:
         explanation = f"none of {record.used} simulations has a finite loss"
         status, reason = "diverged", f"{explanation} ({reason or 'budget used'})"
-    return record.trace(status, reason)
+    return record.make_trace(status, reason)
 
 
 def _run_ask_tell_loop(
@@ -277,19 +275,19 @@ def _run_ask_tell_loop(
         remaining = task.budget - record.used
         if remaining <= 0:
             # The time that the tuner needed for this recommendation is recorded, too.
-            record.late(perf_counter() - requested_at)
+            record.add_late_seconds(perf_counter() - requested_at)
             return "done", ""
         is_cut = len(points) > remaining
+        # A batch beyond the budget is cut; the tuner does not get its evaluations.
         if is_cut:
             points = points[:remaining]
         answered_at = perf_counter()
         observations, losses = evaluate(points)
         simulated_at = perf_counter()
-        record.time(len(points), answered_at - requested_at, simulated_at - answered_at)
+        record.add_seconds(len(points), answered_at - requested_at, simulated_at - answered_at)
         record.add(points, losses, stays=recommendation is not None)
         if simulated_at > deadline:
             return "timeout", ""
-        # The tuner gets the evaluations of complete batches only.
         if is_cut:
             return "done", ""
         requested_at = perf_counter()

@@ -92,6 +92,7 @@ def make_part_spec(
         name: registered name.
         options: options with which it is built.
     """
+    # The class here may be a stub, whose attribute `module` names the module with the code.
     kind, file = registry.get(name), registry.place(name)
     module = getattr(kind, "module", "") or kind.__module__
     preloaded = (

@@ -292,11 +292,17 @@ class InProcessPool:
 
 @dataclass
 class _AssignedCall:
-    """Call that is assigned to a worker."""
+    """Call that waits for a worker or is assigned to one.
 
-    place: int
+    Attributes:
+        index: index among all calls.
+        deaths: number of workers that were killed externally during the call.
+        assigned_at: time of the assignment, as of `monotonic`.
+    """
+
+    index: int
     deaths: int = 0
-    given: float = field(default_factory=monotonic)
+    assigned_at: float = field(default_factory=monotonic)
 
 
 @dataclass
@@ -310,7 +316,7 @@ class _PrefetchPolicy:
     ended: int = 0
     busy: float = 0.0
 
-    def note(self, seconds: float) -> None:
+    def record_duration(self, seconds: float) -> None:
         """Count a call that took a number of seconds."""
         self.ended += 1
         self.busy += seconds
@@ -374,19 +380,19 @@ class LocalPool:
             # Machine code is compiled here, because a worker cannot report what it waits for.
             describe_stepping()
         self._slots = self._slots or [_WorkerSlot(self._plugins) for _ in range(self._jobs)]
-        waiting_calls = deque(_AssignedCall(place) for place in range(len(calls)))
+        waiting_calls = deque(_AssignedCall(index) for index in range(len(calls)))
         pace = _PrefetchPolicy()
         while True:
             self._assign_calls(waiting_calls, pace.depth, calls, limit)
-            futures = [future for slot in self._slots for future in slot.given]
+            futures = [future for slot in self._slots for future in slot.assigned_calls]
             if not futures:
                 return
             # The timeout is needed because a worker that exits with code 0 completes no future.
             wait(futures, timeout=1.0, return_when=FIRST_COMPLETED)
             for slot in self._slots:
                 for call, result in slot.collect(waiting_calls):
-                    pace.note(monotonic() - call.given)
-                    yield call.place, result
+                    pace.record_duration(monotonic() - call.assigned_at)
+                    yield call.index, result
             pace.adapt()
 
     def _assign_calls(
@@ -406,8 +412,8 @@ class LocalPool:
         """
         for _ in range(depth):
             for slot in self._slots:
-                if waiting_calls and len(slot.given) < depth:
-                    slot.give(waiting_calls.popleft(), calls, limit)
+                if waiting_calls and len(slot.assigned_calls) < depth:
+                    slot.assign(waiting_calls.popleft(), calls, limit)
 
 
 class _WorkerSlot:
@@ -419,12 +425,12 @@ class _WorkerSlot:
     def __init__(self, plugins: list[Plugin]) -> None:
         """Start the worker process, which loads the plugins first.
 
-        `_futile` counts consecutive restarts after which no call has ended. `given` are the calls
-        that were assigned to this worker, by future.
+        `_failed_restarts` counts consecutive restarts after which no call has ended.
+        `assigned_calls` are the calls of this worker that have not ended, by future.
         """
         self._plugins = plugins
-        self._futile = 0
-        self.given: dict[Future[Any], _AssignedCall] = {}
+        self._failed_restarts = 0
+        self.assigned_calls: dict[Future[Any], _AssignedCall] = {}
         self._start_process()
 
     def _start_process(self) -> None:
@@ -459,7 +465,7 @@ class _WorkerSlot:
         ending.start()
         ending.join(timeout=_EXIT_WAIT_SECONDS)
 
-    def give(self, call: _AssignedCall, calls: Sequence[Call], limit: float | None) -> None:
+    def assign(self, call: _AssignedCall, calls: Sequence[Call], limit: float | None) -> None:
         """Assign a call to the process; replace a pool that broke in the meantime.
 
         Args:
@@ -467,14 +473,14 @@ class _WorkerSlot:
             calls: all calls.
             limit: hard time limit in seconds; None for no limit.
         """
-        function, arguments = calls[call.place]
-        call.given = monotonic()
+        function, arguments = calls[call.index]
+        call.assigned_at = monotonic()
         try:
             future = self._pool.schedule(function, args=arguments, timeout=limit)
         except RuntimeError:  # the pool broke between two calls
             self._replace_process()
             future = self._pool.schedule(function, args=arguments, timeout=limit)
-        self.given[future] = call
+        self.assigned_calls[future] = call
 
     def collect(self, waiting: deque[_AssignedCall]) -> list[tuple[_AssignedCall, Any]]:
         """Return the calls of this worker that have ended, and replace the worker if it is lost.
@@ -488,11 +494,11 @@ class _WorkerSlot:
         """
         ended_calls: list[tuple[_AssignedCall, Any]] = []
         is_lost = False
-        for future in [future for future in self.given if future.done()]:
-            call, error = self.given.pop(future), future.exception()
+        for future in [future for future in self.assigned_calls if future.done()]:
+            call, error = self.assigned_calls.pop(future), future.exception()
             is_lost = is_lost or _loses_the_worker(error)
             if error is None:
-                self._futile = 0
+                self._failed_restarts = 0
             if _should_retry(call, error):
                 waiting.appendleft(call)
             else:
@@ -501,11 +507,13 @@ class _WorkerSlot:
                 )
         if not is_lost and self._was_replaced_without_result():
             is_lost = True
-            running = next(future for future in self.given if future.running())
-            ended_calls.append((self.given.pop(running), WorkerDiedError(_describe_worker_exit(0))))
+            running = next(future for future in self.assigned_calls if future.running())
+            ended_calls.append(
+                (self.assigned_calls.pop(running), WorkerDiedError(_describe_worker_exit(0)))
+            )
         if is_lost:
-            self._futile = 0 if ended_calls else self._futile
-            waiting.extendleft(reversed(self.given.values()))
+            self._failed_restarts = 0 if ended_calls else self._failed_restarts
+            waiting.extendleft(reversed(self.assigned_calls.values()))
             self._replace_process()
         return ended_calls
 
@@ -514,7 +522,7 @@ class _WorkerSlot:
         while self._start_receiver.poll():
             self._start_receiver.recv()
             self._start_count += 1
-        return self._start_count > 1 and any(future.running() for future in self.given)
+        return self._start_count > 1 and any(future.running() for future in self.assigned_calls)
 
     def _replace_process(self) -> None:
         """Replace a lost worker process.
@@ -523,12 +531,12 @@ class _WorkerSlot:
             InputError: too many processes died in turn without finishing a call. Without
                 this limit, a worker that cannot start would be restarted forever.
         """
-        self._futile += 1
-        if self._futile > _MAX_IMMEDIATE_DEATHS:
+        self._failed_restarts += 1
+        if self._failed_restarts > _MAX_IMMEDIATE_DEATHS:
             raise InputError(
                 "worker processes die as soon as they start; see the messages above, if any"
             )
-        self.given.clear()
+        self.assigned_calls.clear()
         self.stop()
         self._start_receiver.close()
         self._start_process()
