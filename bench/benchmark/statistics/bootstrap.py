@@ -126,7 +126,7 @@ RESAMPLES = 1000
 def draw_target_resamples(targets: int, *names: str) -> NDArray[np.int64]:
     """Draw target indices with replacement, from a random stream that depends on names only.
 
-    Tuners that share the targets get the same draws.
+    Tuners that share the targets get the same draws, so that their statistics can be compared.
 
     Args:
         targets: number of targets.
@@ -139,8 +139,11 @@ def draw_target_resamples(targets: int, *names: str) -> NDArray[np.int64]:
 
 
 def compute_percentile_interval(values: Array) -> tuple[float, float]:
-    """Return the 95 % percentile interval of resampled values, which may be infinite."""
-    # Order statistics are used without interpolation, because values may be infinite.
+    """Return the 95 % percentile interval of resampled values (n,), which may be infinite.
+
+    The ends are values themselves, without interpolation, which would fail for infinite ones.
+    Positions between two values are rounded outwards.
+    """
     ordered = np.sort(values)
     n = len(ordered)
     lower, upper = (share * (n - 1) for share in INTERVAL_QUANTILES)

@@ -26,15 +26,17 @@ def chi_squared_tail(freedom: int, statistic: float) -> float:
     """
     if freedom < 1:
         raise ValueError(f"expected at least 1 degree of freedom, found {freedom}")
-    if statistic != statistic:
+    if statistic != statistic:  # NaN
         return statistic
     if statistic <= 0.0:
         return 1.0
     if statistic == inf:
         return 0.0
     h = statistic / 2.0
+    # The exponents of h are i for even k, and i - 1/2 for odd k.
     half_remainder = (freedom % 2) / 2.0
-    # Logarithms, since e^{-h} alone is 0 where h is above 745.
+    # Terms of (1) or (2), as exponentials of sums of logarithms, since e^{-h} alone is 0 where h is
+    # above 745.
     terms = [
         exp((i - half_remainder) * log(h) - lgamma(i - half_remainder + 1.0) - h)
         for i in range(1 if half_remainder else 0, (freedom + 1) // 2)
@@ -58,6 +60,7 @@ def chi_squared_quantile(freedom: int, tail: float) -> float:
     if not 0.0 < tail <= 1.0:
         raise ValueError(f"expected a probability above 0 and at most 1, found {tail}")
     low, high = 0.0, float(max(freedom, 1))
+    # The tail falls with the statistic: double the upper bound until the quantile is below it.
     while chi_squared_tail(freedom, high) > tail:
         low, high = high, 2.0 * high
     while low < (middle := (low + high) / 2.0) < high:

@@ -115,9 +115,9 @@ class ComparisonStatistics:
         return [*ranked, *(t for t in self.order if t not in ranked)]
 
     def sort_rows(self, frame: pd.DataFrame) -> pd.DataFrame:
-        """Sort rows that have the columns range and tuner: range by range, the best tuner first.
+        """Sort the rows of a table range by range, and in each range the best tuner first.
 
-        Rows of tuners that could not be used come last.
+        Rows of tuners that could not be used, which have no range, come last.
 
         Args:
             frame: Table with the columns `range` and `tuner`.
@@ -125,7 +125,6 @@ class ComparisonStatistics:
         kinds = [str(kind) for kind in dict.fromkeys(self._all_runs.keys["range"])]
         order = [(kind, tuner) for kind in kinds for tuner in self.order_in(kind)]
         position_of_key = {key: position for position, key in enumerate(order)}
-        # A tuner that could not be used has no range.
         keys = [
             position_of_key.get(key, len(position_of_key))
             for key in zip(frame["range"], frame["tuner"], strict=True)
@@ -403,6 +402,7 @@ def build_identifiability_table(
         [
             experiment.name,
             target,
+            # The name of a target begins with its range, as in `wide-017`.
             target.split("-")[0],
             i + 1,
             spectrum.values[i],

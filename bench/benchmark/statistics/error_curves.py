@@ -79,9 +79,11 @@ class RunCurves:
         Returns:
             Sorted names of the targets, and the row indices of each target.
         """
+        # The code of a run is the position of its target in `names`.
         codes, names = pd.factorize(self.keys["target"], sort=True)
         group_ends = np.cumsum(np.bincount(codes, minlength=len(names)))
         groups = np.split(np.argsort(codes, kind="stable"), group_ends[:-1])
+        # Without runs, `split` still returns one empty group.
         return [str(n) for n in names], groups[: len(names)]
 
     def after(self, k: int) -> Array:
@@ -121,7 +123,8 @@ class RunRowTable:
         # The matrices of all metrics use the same row and column indices.
         codes, names = pd.factorize(runs["run"])
         self._codes, self._k = codes, runs["k"].to_numpy(dtype=np.int64)
-        # The assignment runs in reverse order, so that the first row of each run remains.
+        # Table row at which each run begins. It is assigned in reverse order, so that the first row
+        # of each run remains.
         first = np.zeros(len(names), dtype=np.int64)
         first[codes[::-1]] = np.arange(len(codes))[::-1]
         self.keys = (
@@ -206,9 +209,13 @@ class PrimaryMetric(NamedTuple):
 def select_primary_metric(runs: pd.DataFrame) -> PrimaryMetric:
     """Select the metric that decides a comparison.
 
-    It is the parameter error if the true parameters are known, otherwise the error on held-out
-    runs. If some target has sloppy directions, it is the error along stiff directions, because the
-    data do not determine the others. A target without a stiff direction is then left out.
+    * If some target has sloppy directions, it is the error along stiff directions, because the data
+      do not determine the others. A target without a stiff direction is then left out.
+    * Otherwise it is the parameter error if the true parameters are known, else the error on
+      held-out runs, else that on the fitted runs.
+
+    Args:
+        runs: rows of runs.parquet.
     """
     sloppy = "sloppy_error" in runs and runs["sloppy_error"].notna().any()
     if sloppy and runs["stiff_error"].notna().any():
@@ -279,10 +286,11 @@ def build_error_table(
         is_part = rows.keys.index.isin(part.index)
         # Simulations and seconds of a training; zero for a tuner that is not trained.
         fit = (trainings or {}).get(str(tuner), (0.0, 0.0))
-        seconds = [
+        # Mean seconds in the tuner and in the simulator, by number of simulations.
+        tuner_seconds, simulator_seconds = (
             np.full(len(points), np.nan) if s is None else s[is_part][:, points].mean(axis=0)
             for s in spent_seconds
-        ]
+        )
         counts = len(part), int(rows.failed[is_part].sum())
         for metric, curve in curves.items():
             values = _summarise_over_targets(
@@ -290,7 +298,7 @@ def build_error_table(
             )
             for point_index, simulations in enumerate(points):
                 errors = values[:, point_index]
-                times = (seconds[0][point_index], seconds[1][point_index])
+                times = (tuner_seconds[point_index], simulator_seconds[point_index])
                 key = (experiment, tuner, kind, simulations, metric)
                 lines.append((*key, *errors, *counts, *fit, *times))
     # A tuner that could not be used has a row too, so that the table names every tuner.
@@ -459,7 +467,7 @@ def compute_medians_by_distance(
     for k in points:
         for tuner, by_target in errors.items():
             values = by_target[k].dropna().clip(lower=ERROR_FLOOR)
-            for b, names in groups.items():
+            for group, names in groups.items():
                 group_values = values.reindex(names).dropna().to_numpy()
                 if len(group_values):
                     distance_limits = float(distances[names].min()), float(distances[names].max())
@@ -467,10 +475,10 @@ def compute_medians_by_distance(
                         (
                             k,
                             tuner,
-                            b,
+                            group,
                             *distance_limits,
                             len(names),
-                            *_compute_median_with_interval(group_values, tuner, b),
+                            *_compute_median_with_interval(group_values, tuner, group),
                         )
                     )
     return pd.DataFrame(lines, columns=DISTANCE_COLUMNS)
@@ -483,14 +491,20 @@ def _get_values(frame: pd.DataFrame) -> Array:
 def _group_by_distance(distances: pd.Series[float]) -> dict[int, list[str]]:
     """Group targets by their distance from the training range.
 
-    Group 0 has the targets inside; those outside are divided into groups of about equal size, the
-    nearest first. Empty groups are left out.
+    Group 0 has the targets inside; those outside are divided into at most `_MAX_GROUPS` groups of
+    about equal size, the nearest first. Empty groups are left out.
+
+    Args:
+        distances: distance of each target, by target name; 0 inside the training range.
+
+    Returns:
+        Names of the targets by number of the group.
     """
     names_inside = list(distances.index[distances <= 0])
     outside = list(distances[distances > 0].sort_values(kind="stable").index)
     count = min(max(len(outside) // _MIN_GROUP_SIZE, 1), _MAX_GROUPS)
     parts = [list(part) for part in np.array_split(np.array(outside, dtype=object), count)]
-    return {b: names for b, names in enumerate([names_inside, *parts]) if names}
+    return {group: names for group, names in enumerate([names_inside, *parts]) if names}
 
 
 def _compute_median_with_interval(

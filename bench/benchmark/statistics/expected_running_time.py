@@ -51,6 +51,7 @@ def select_thresholds(curves: RunCurves, simulated: bool) -> tuple[Array, tuple[
     best = min(float(np.nanmin(curves.compute_final_values())), 0.5 * start)
     # Slightly above the smallest error, so that the best run reaches it despite rounding.
     thresholds = np.geomspace(start, 1.001 * best, 21)
+    # The table has five of them, more of the tight ones.
     return thresholds, tuple(float(x) for x in thresholds[[5, 10, 15, 18, 20]])
 
 
@@ -70,7 +71,7 @@ def compute_hitting_times(curves: RunCurves, threshold: float) -> Array:
     # The comparison is negated, so that NaN counts as above the threshold.
     is_above = ~(curves.values <= threshold)
     steps = is_above.shape[1]
-    # The first index after the last value above the threshold.
+    # Index after the last value above the threshold; 0 if no value is above it.
     last = steps - np.argmax(is_above[:, ::-1], axis=1)
     last = np.where(is_above.any(axis=1), last, 0)
     return np.where((last >= steps) | curves.failed, np.inf, last.astype(np.float64))
@@ -155,10 +156,10 @@ def compute_effort(
         seconds = tuner_seconds[np.arange(len(simulations)), column]
     _, groups = curves.group_by_target()
     return ThresholdEffort(
-        np.array([simulations[rows].sum() for rows in groups]),
-        np.array([seconds[rows].sum() for rows in groups]),
-        np.array([success[rows].sum() for rows in groups]),
-        len(simulations),
+        simulations=np.array([simulations[rows].sum() for rows in groups]),
+        seconds=np.array([seconds[rows].sum() for rows in groups]),
+        successes=np.array([success[rows].sum() for rows in groups]),
+        runs=len(simulations),
     )
 
 

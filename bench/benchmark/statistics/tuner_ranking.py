@@ -151,7 +151,7 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
         budget: largest number of simulations.
         floor: error at or below which errors count as equal.
     """
-    failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
+    has_failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
     rankings: dict[int, _Ranking] = {}
     earlier_ranks: list[pd.Series[float]] = []
     for simulations in list_ranking_points(budget):
@@ -159,7 +159,7 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
         # Rounding gives errors that differ by the last bits the same rank.
         medians, mean_logs = logs.median().round(9), logs.mean().round(9)
         ranks = medians.rank(method="min")
-        keys = [pd.Series(failed), medians, mean_logs, *reversed(earlier_ranks)]
+        keys = [pd.Series(has_failed), medians, mean_logs, *reversed(earlier_ranks)]
         order = sorted(logs.columns, key=lambda t: [float(key[t]) for key in keys])
         rankings[simulations] = _Ranking(logs, ranks, order)
         earlier_ranks.append(ranks)
@@ -178,7 +178,7 @@ def _build_verdict_rows(
     Args:
         ranking: tuners in the order of their median errors.
         curves: errors of each run over the number of simulations.
-        key: first columns of each row.
+        key: first columns of each row: experiment, range and number of simulations.
     """
     logs, ranks, order = ranking
     runs = {t: curves.select(tuner=t).failed for t in order}
@@ -200,6 +200,7 @@ def _build_verdict_rows(
             verdict = FAILED
         elif tuner == best:
             verdict = BEST
+        # A negative effect means larger errors than those of the best tuner.
         elif p_holm < SIGNIFICANCE and test.effect < 0:
             verdict = WORSE
         else:
@@ -221,7 +222,11 @@ def _build_verdict_rows(
 
 
 def _compute_median_error(logs: pd.Series[float]) -> float:
-    """Return the median error; infinite if half of the targets failed."""
+    """Return the median error over targets; infinite if half of the targets failed.
+
+    Args:
+        logs: logarithms of the errors; a failed target has a number above `_NO_ERROR`.
+    """
     middle = float(logs.median())
     return float(np.exp(middle)) if middle < _NO_ERROR else np.inf
 

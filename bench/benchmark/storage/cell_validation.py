@@ -206,10 +206,10 @@ def check_cells(
     def format_cell(row: int) -> str:
         return "nothing" if empty[row] else f"{numbers[row]}"
 
-    outside = ~empty & ~((numbers >= column.low) & (numbers <= column.high))
+    exceeds_limits = ~empty & ~((numbers >= column.low) & (numbers <= column.high))
     if not column.infinite:
-        outside |= np.isinf(numbers)
-    _raise_for_bad_row(column, outside, format_cell)
+        exceeds_limits |= np.isinf(numbers)
+    _raise_for_bad_row(column, exceeds_limits, format_cell)
     must_be_empty = {
         EmptyCellRule.NEVER: np.zeros(len(numbers), dtype=bool),
         EmptyCellRule.MAY: empty,  # Whatever is empty may be so.

@@ -167,7 +167,7 @@ class CsvTable:
     def _get_line_number(self, row: int) -> int:
         """Return the line number of a row; the first record is the header."""
         lines = (
-            number for place, (number, _) in enumerate(self._iterate_records()) if place == row + 1
+            number for index, (number, _) in enumerate(self._iterate_records()) if index == row + 1
         )
         return next(lines, row + 2)
 
@@ -299,8 +299,9 @@ def _read_checked_runs(
     runs: pd.DataFrame = pa.table(constants).to_pandas().assign(row=rows, used=used)
     is_repeated = runs["run"].duplicated().to_numpy(dtype=bool)
     if is_repeated.any():
-        place = int(is_repeated.argmax())
-        raise CellError(int(rows[place]), "run", "every run once", f"{runs['run'][place]} again")
+        repeated = int(is_repeated.argmax())
+        name = runs["run"][repeated]
+        raise CellError(int(rows[repeated]), "run", "every run once", f"{name} again")
     return runs
 
 

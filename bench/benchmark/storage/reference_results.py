@@ -177,7 +177,8 @@ def _is_reference_folder(folder: Path) -> bool:
 def find_reference(name: str) -> ReferenceResult:
     """Find a reference by its name, or by the folder of any comparison.
 
-    ``comparison/ball-wind`` is also found as ``ball-wind`` if no other reference has this name.
+    A name is tried in this order: the whole name of a reference; its end, as ``ball-wind`` for
+    ``comparison/ball-wind``, if only one reference ends so; a folder of the user.
 
     Raises:
         InputError: There is no such reference, or it is damaged.

@@ -70,12 +70,14 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
 
     planned_runs = []
     for row, name in enumerate(plan):
+        # The id is split from its end, since a label may contain slashes.
         parts = name.rsplit("/", 3)
-        if len(parts) != 4 or not _SEED_PATTERN.fullmatch(parts[2]):
+        tuner, target, seed, _ = parts if len(parts) == 4 else [""] * 4
+        if not _SEED_PATTERN.fullmatch(seed):
             raise make_line_error(
                 row, f"expected TUNER/TARGET/SEED/HASH, found {format_value(name)}"
             )
-        planned_runs.append((name, parts[0], parts[1], int(parts[2])))
+        planned_runs.append((name, tuner, target, int(seed)))
     plan_table = pd.DataFrame(planned_runs, columns=["run", "tuner", "target", "seed"])
     names = plan_table["run"]
     raise_for_first_bad_row(
@@ -297,6 +299,7 @@ def check_statuses(
     id_prefixes = (
         statuses["tuner"] + "/" + statuses["target"] + "/" + statuses["seed"].astype(str) + "/"
     )
+    # The id of a tuner that was skipped is its label alone.
     has_valid_id = [
         run == tuner if is_skipped else run.startswith(prefix)
         for run, tuner, prefix, is_skipped in zip(
@@ -369,6 +372,7 @@ def check_rows_match_statuses(
     file_rows = runs["row"].to_numpy()
     names = runs["run"]
 
+    # Errors are reported at the row of the file with which the run begins.
     def make_row_error(i: int, reason: str) -> InputError:
         return file.make_error(int(file_rows[i]), reason)
 
@@ -416,22 +420,19 @@ def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> N
         InputError: A check fails.
     """
 
-    def at(i: int, problem: str) -> InputError:
+    def make_row_error(i: int, problem: str) -> InputError:
         return file.make_error(int(runs["row"][i]), problem)
 
-    check_known(runs["experiment"], [experiment.name], "experiment", at)
-    check_equal(
-        runs["range"],
-        runs["target"].str.replace(r"-\d+$", "", regex=True),
-        "range",
-        "of its target",
-        at,
-    )
+    check_known(runs["experiment"], [experiment.name], "experiment", make_row_error)
+    # The name of a target is its range and a number, as `wide-017`.
+    ranges_of_targets = runs["target"].str.replace(r"-\d+$", "", regex=True)
+    check_equal(runs["range"], ranges_of_targets, "range", "of its target", make_row_error)
     for name in runs.columns:
         if name.startswith("true_"):
             first = runs.drop_duplicates("target").set_index("target")[name]
             expected = runs["target"].map(first)
-            check_equal(runs[name], expected, name, "as in other runs on this target", at)
+            reason = "as in other runs on this target"
+            check_equal(runs[name], expected, name, reason, make_row_error)
 
 
 def check_journal_statuses(

@@ -234,8 +234,9 @@ def write_results(
     training = pd.DataFrame(sorted(trainings), columns=["tuner", "seed", "simulations", "seconds"])
     training["trusted"] = trusted
     write_atomically(folder / "training.csv", training.to_csv(index=False))
+    # The statuses are stored by index in the plan.
     rows_of_statuses = [
-        asdict(journal.statuses[place]) for place in sorted(journal.statuses)
+        asdict(journal.statuses[index]) for index in sorted(journal.statuses)
     ] + list(skipped)
     statuses = pd.DataFrame(rows_of_statuses, columns=STATUS_COLUMN_NAMES)
     write_atomically(folder / "status.csv", statuses.to_csv(index=False))
@@ -333,8 +334,7 @@ def _add_missing_columns(
 def _compute_training_costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:
     """Compute simulations and seconds of one training, mean over seeds, by tuner."""
     mean_costs = training.groupby("tuner")[["simulations", "seconds"]].mean()
-    values = mean_costs.to_numpy(dtype=float)
     return {
-        str(name): (float(row[0]), float(row[1]))
-        for name, row in zip(mean_costs.index, values, strict=True)
+        str(tuner): (float(simulations), float(seconds))
+        for tuner, simulations, seconds in mean_costs.itertuples()
     }

@@ -111,9 +111,11 @@ def read_records(path: Path) -> Iterator[JournalRecord]:
         while len(header := file.read(_RECORD_HEADER.size)) == _RECORD_HEADER.size and any(header):
             mark, head_size, rows_size, checksum = _RECORD_HEADER.unpack(header)
             payload = file.read(head_size + rows_size) if mark == _RECORD_MARK else b""
+            # The last record was cut off.
             if mark == _RECORD_MARK and len(payload) < head_size + rows_size:
                 return
             if mark != _RECORD_MARK or zlib.crc32(payload) != checksum:
+                # The last record was not written completely.
                 if file.tell() >= file_size:
                     return
                 raise _make_damage_error(path, f"a record before byte {file.tell()}, found damage")
@@ -227,8 +229,8 @@ class RunJournal:
     def __init__(self, folder: Path) -> None:
         """Lock the folder against other processes, and recover all runs that it contains.
 
-        `_row_places` are the position and length in bytes of the rows of each run, which stay on
-        disk.
+        `_row_extents` has the position and the length in bytes of the rows of each run, which stay
+        on disk.
 
         Args:
             folder: folder of the comparison.
@@ -243,19 +245,19 @@ class RunJournal:
         self.path = self.folder / JOURNAL_FILE
         _refuse_earlier_files(self.folder)
         self._lock = open_locked(self.folder / "lock", self.folder.parent)
-        places: list[tuple[int, int]] = []
+        extents: list[tuple[int, int]] = []
         heads: list[bytes] = []
         self._end = 0
         try:
             for record in read_records(self.path):
                 self._end = record.end
                 heads.append(record.head)
-                places.append((record.end - len(record.rows), len(record.rows)))
+                extents.append((record.end - len(record.rows), len(record.rows)))
             self.statuses = parse_statuses(self.path, heads)
         except InputError:
             self._lock.close()
             raise
-        self._row_places = dict(zip(self.statuses, places, strict=True))
+        self._row_extents = dict(zip(self.statuses, extents, strict=True))
         # Unbuffered: what is written must survive a kill of this process.
         self._file = self.path.open("r+b" if self.path.exists() else "w+b", buffering=0)
         # Remove a record that was cut off by a kill, or the next one would follow an incomplete
@@ -280,7 +282,7 @@ class RunJournal:
         self._end += len(record)
         _, _, rows_size, _ = _RECORD_HEADER.unpack_from(record)
         self.statuses[plan_index] = status
-        self._row_places[plan_index] = self._end - rows_size, rows_size
+        self._row_extents[plan_index] = self._end - rows_size, rows_size
 
     def iterate_tables(self, runs: int = 2000) -> Iterator[tuple[list[int], pa.Table]]:
         """Yield the finished runs in the order of the plan, chunk by chunk.
@@ -302,7 +304,7 @@ class RunJournal:
             chunk = plan_indices[first : first + runs]
             try:
                 with self.path.open("rb") as file:
-                    tables = [decode_rows(_read_bytes(file, *self._row_places[i])) for i in chunk]
+                    tables = [decode_rows(_read_bytes(file, *self._row_extents[i])) for i in chunk]
                 rows = pa.concat_tables(tables).combine_chunks()
             except (OSError, pa.ArrowException) as error:
                 raise _make_damage_error(

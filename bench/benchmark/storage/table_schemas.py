@@ -71,15 +71,16 @@ class ColumnSpec:
         """Description of a valid cell, for messages."""
         if self.words:
             return f"one of {', '.join(word for word in self.words if word)}"
-        if self.kind in (str, bool):
-            return {str: "text", bool: "True or False"}[self.kind]
-        limit_texts = {
-            (False, False): "",
-            (True, False): f" of at least {self.low:g}",
-            (True, True): f" from {self.low:g} to {self.high:g}",
-        }[self.low > -math.inf, self.high < _MAX_EXACT_INTEGER]
+        if self.kind is str:
+            return "text"
+        if self.kind is bool:
+            return "True or False"
         number = "a whole number" if self.kind is int else "a number"
-        return f"{number}{limit_texts}"
+        if self.low == -math.inf:
+            return number
+        if self.high >= _MAX_EXACT_INTEGER:
+            return f"{number} of at least {self.low:g}"
+        return f"{number} from {self.low:g} to {self.high:g}"
 
 
 Columns = Sequence[ColumnSpec]
@@ -337,7 +338,9 @@ OPTIONAL_ENVIRONMENT_KEYS = ("fingerprint", "seals", "stepping", "redrawn_target
 def expand_columns(
     columns: Columns, parameters: Iterable[str], channels: Iterable[str]
 ) -> list[ColumnSpec]:
-    """Replace placeholder columns by one column for each parameter and channel.
+    """Replace each column with a placeholder by one column for each parameter or channel.
+
+    ``true_PARAMETER`` becomes ``true_damping`` and so on. Other columns are kept.
 
     Args:
         columns: Declared columns.
