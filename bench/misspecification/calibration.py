@@ -42,6 +42,7 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
     point = streams.get_stream("truth").uniform(
         training_box[0], training_box[1], size=problem.cube.dim
     )
+    # The true system (`world`) has the first of the tuned parameters.
     theta = problem.cube.to_physical(point[None])[:, : len(problem.world.parameters)]
     initial = {**experiment.initial, **calibration.initial}
     inputs = {**experiment.inputs, **calibration.inputs}
@@ -55,10 +56,17 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
         rng = TargetStreams(salt, experiment.name, "calibration", 1 + run_index).get_stream("noise")
         measured = noise_free + problem.noise * rng.standard_normal(noise_free.shape)
         channels = dict(zip(names, np.ascontiguousarray(measured.T), strict=True))
-        held_out = run_index >= calibration.runs - calibration.held_out
-        # Runs are named from 1.
-        name = str(run_index + 1)
-        runs.append(Run(name, scene.times, channels, scene.inputs, scene.constants, {}, held_out))
+        runs.append(
+            Run(
+                name=str(run_index + 1),  # runs are named from 1
+                times=scene.times,
+                channels=channels,
+                inputs=scene.inputs,
+                constants=scene.constants,
+                initial={},
+                held_out=run_index >= calibration.runs - calibration.held_out,
+            )
+        )
     kind = type(problem.simulator)
     model = None
     if experiment.model:

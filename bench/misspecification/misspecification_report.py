@@ -64,6 +64,7 @@ def draw_figures(
     Returns:
         Figures by name.
     """
+    # `place` is the position of a tuner on the axis of tuners of its study.
     places = {
         (study.experiment.name, tuner): place
         for study in studies
@@ -72,8 +73,9 @@ def draw_figures(
     table = frames["table"]
     keys = zip(table["experiment"], table["tuner"], strict=True)
     table = table.assign(place=[places[key] for key in keys])
-    counts = sorted({len(study.list_targets()) for study in studies})
-    targets = f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} targets"
+    counts = [len(study.list_targets()) for study in studies]
+    count_range = dict.fromkeys((min(counts), max(counts)))  # one number if both are equal
+    targets = f"{' to '.join(map(str, count_range))} targets"
     bias, prediction = [], []
     for study in studies:
         parameter = _find_largest_bias(table[table["experiment"] == study.experiment.name])
@@ -112,6 +114,7 @@ def _make_mean_panel(study: StudyScores, title: str, axis: Axis, **where: str) -
         axis: axis of the means.
         **where: cells of the score table that select the means.
     """
+    # The true system has these effects, and the simulator lacks them.
     missing = ", ".join(study.experiment.world.get("fixed", {})) or "nothing"
     where = {"experiment": study.experiment.name, **where}
     series = tuple(
@@ -195,9 +198,9 @@ def _find_largest_bias(lines: pd.DataFrame) -> str:
     """
     plain_lines = lines[(lines["model"] == PLAIN) & (lines["metric"] == BIAS)]
     reference = plain_lines[plain_lines["tuner"] == _REFERENCE_TUNER]
-    sizes = (reference if len(reference) else plain_lines).groupby("parameter", sort=False)["mean"]
-    largest = sizes.mean().abs().fillna(0.0)
-    return [str(name) for name in largest.index][int(largest.to_numpy().argmax())]
+    shown_lines = reference if len(reference) else plain_lines
+    biases = shown_lines.groupby("parameter", sort=False)["mean"].mean().abs().fillna(0.0)
+    return str(biases.idxmax())
 
 
 _TEMPLATE = Path(__file__).with_name("misspecification.txt")
@@ -308,20 +311,21 @@ def _write_tables_and_figures(
         write_atomically(
             folder / f"{name}.csv", add_trust_column(frame, experiment).to_csv(index=False)
         )
-    values = {
+    values: dict[str, Any] = {
         "studies": [
             (scores, _read_verdict(folder / scores.experiment.name if is_joint else folder))
             for scores in outcomes
         ],
         "error_tables": [_build_error_table(scores, frames["table"]) for scores in outcomes],
         "agreement": frames["ranking"].to_dict("records"),
-        "joint": [
-            (metric, ranks, pd.DataFrame({m: ranks.ranked[m].mean() for m in MODEL_LABELS}))
-            for metric in misspecification_scores.RANKED_METRICS
-            if is_joint
-            for ranks in [misspecification_scores.compute_joint_ranks(frames["ranks"], metric)]
-        ],
+        "joint": [],
     }
+    if is_joint:
+        # Each metric, the ranks over all systems, and the mean rank of each tuner by simulator.
+        for metric in misspecification_scores.RANKED_METRICS:
+            ranks = misspecification_scores.compute_joint_ranks(frames["ranks"], metric)
+            mean_ranks = pd.DataFrame({m: ranks.ranked[m].mean() for m in MODEL_LABELS})
+            values["joint"].append((metric, ranks, mean_ranks))
     for line in render_text(_TEMPLATE, **values, PARAMETERS=PARAMETERS, models=MODEL_LABELS):
         print_line(line)
     for name, figure in draw_figures(outcomes, frames).items():

@@ -158,14 +158,13 @@ def _select_complete_targets(errors: pd.DataFrame) -> pd.DataFrame:
     Args:
         errors: rows of `StudyScores.errors` of both simulators.
     """
+    # A complete target has as many runs (seeds) as any other target of the same tuner.
     seed_counts = errors.groupby(["model", "tuner"])["runs"].transform("max")
-    # A tuner that was skipped in one simulator is excluded from both.
     common_tuners = set.intersection(*(set(part["tuner"]) for _, part in errors.groupby("model")))
     complete = errors[(errors["runs"] == seed_counts) & errors["tuner"].isin(common_tuners)]
-    runs_per_target = complete.groupby("target").size()
-    complete_targets = set(
-        runs_per_target[runs_per_target == len(MODEL_LABELS) * len(common_tuners)].index
-    )
+    # A row is a tuner on a target in one of the two simulators.
+    row_counts = complete.groupby("target").size()
+    complete_targets = set(row_counts[row_counts == len(MODEL_LABELS) * len(common_tuners)].index)
     return complete[complete["target"].isin(complete_targets)].reset_index(drop=True)
 
 
@@ -192,7 +191,8 @@ def _build_error_rows(
         frame[parameter.name] = np.where(rows.failed, np.nan, (recommended - true) / width)
     names = [parameter.name for parameter in parameters]
     frame[PARAMETERS] = frame[names].abs().mean(axis=1, skipna=False)
-    for name in names:  # the mean over seeds of the absolute value is computed separately
+    # The absolute errors have columns of their own, whose means over seeds are taken below.
+    for name in names:
         frame[f"|{name}|"] = frame[name].abs()
     frame[PREDICTION] = np.where(rows.failed, np.nan, rows.build_curves(PREDICTION).values[:, -1])
     frame["runs"], frame["failures"] = 1, rows.failed.astype(int)
@@ -354,12 +354,16 @@ def compute_joint_ranks(ranked: pd.DataFrame, metric: str) -> JointRanks:
     part = ranked[ranked["metric"] == metric]
     tables, friedman, significant_pairs = {}, {}, {}
     for model in MODEL_LABELS:
-        errors_by_tuner = part.pivot(index="experiment", columns="tuner", values=model)
-        errors_by_tuner = errors_by_tuner[list(dict.fromkeys(part["tuner"]))].dropna(axis="columns")
-        tables[model] = errors_by_tuner.rank(axis=1)
+        # Mean rank over targets: one row per system, one column per tuner that all systems have.
+        mean_ranks_by_system = part.pivot(index="experiment", columns="tuner", values=model)
+        tuners_in_order = list(dict.fromkeys(part["tuner"]))
+        mean_ranks_by_system = mean_ranks_by_system[tuners_in_order].dropna(axis="columns")
+        tables[model] = mean_ranks_by_system.rank(axis=1)
         friedman[model], significant_pairs[model] = float("nan"), 0
-        if len(errors_by_tuner) >= MIN_PROBLEMS_FOR_RANKS and errors_by_tuner.shape[1] >= 3:
+        system_count, tuner_count = tables[model].shape
+        if system_count >= MIN_PROBLEMS_FOR_RANKS and tuner_count >= 3:
             friedman[model], p_values = compute_nemenyi_p_values(tables[model])
+            # Each pair is once above the diagonal; the other elements of `upper` are 0.
             upper = np.triu(p_values.to_numpy(), k=1)
             significant_pairs[model] = int(((upper > 0) & (upper < SIGNIFICANCE_LEVEL)).sum())
     tuners = [t for t in tables[PLAIN] if t in tables[EXTENDED]]

@@ -95,12 +95,10 @@ class MisspecificationStudy(Study):
         for model in MODEL_LABELS:
             comparison = self._open_comparison(model, jobs)
             outcome = comparison.run(jobs, progress, pool)
-            finished_count, planned_count = (
-                finished_count + outcome.finished,
-                planned_count + outcome.planned,
-            )
+            finished_count += outcome.finished
+            planned_count += outcome.planned
             if not outcome.is_complete:
-                # The comparison that has not started has the same number of runs.
+                # The second comparison, which has not started, has the same number of runs.
                 not_started = outcome.planned if model == PLAIN else 0
                 return StudyOutcome(
                     finished_count,
@@ -110,6 +108,7 @@ class MisspecificationStudy(Study):
                     outcome.skipped,
                 )
         self.reveal_salt()
+        # The folder of segments contained only the salt.
         segments = self.folder / SEGMENTS_FOLDER
         if segments.is_dir() and not any(segments.iterdir()):
             segments.rmdir()
@@ -247,18 +246,18 @@ def make_base_experiment(experiment: Experiment) -> Experiment:
 
 
 def make_extended_experiment(experiment: Experiment, effects: dict[str, list[float]]) -> Experiment:
-    """Make the experiment in the extended simulator.
+    """Make the experiment in the extended simulator, which has the hidden effects.
 
-    The tuned parameters remain the same. The missing effects act with the coefficients that explain
+    The tuned parameters remain the same. The hidden effects act with the coefficients that explain
     fitted.
 
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
-        effects: coefficients by name of the effect.
+        effects: fitted coefficients by name of the effect.
     """
     settings = dict(experiment.settings)
     # An effect that is tuned stays tuned, although explain fitted its coefficients too.
-    tuned = {*settings.get("effects", ()), *(p for p in experiment.parameters)}
+    tuned = {*settings.get("effects", ()), *experiment.parameters}
     fixed_effects = {name: values for name, values in effects.items() if name not in tuned}
     settings["fixed"] = {**settings.get("fixed", {}), **fixed_effects}
     return _make_comparison_experiment(experiment, EXTENDED, settings)

@@ -85,7 +85,7 @@ def draw_chart(
     """
     # Without a panel, such as costs of tuners that never reach the error, the figure is empty.
     columns = columns or max(len(panels), 1)
-    row_count = max(-(-len(panels) // columns), 1)
+    row_count = max(-(-len(panels) // columns), 1)  # rounded up
     width, height = size or PANEL_SIZE
     shared = all(
         panel.up == panels[0].up and (not horizontal or panel.across == panels[0].across)
@@ -96,6 +96,7 @@ def draw_chart(
         columns,
         # Width and height in inches: margins and panels.
         (1.2 + width * columns, 0.6 + height * row_count),
+        # Panels of one row share their vertical axis, unless all panels do.
         sharey=shared or ("row" if row_count > 1 and not horizontal else False),
         sharex=row_count > 1 and not horizontal,
     )

@@ -60,10 +60,10 @@ def draw_intervals(
     Returns:
         The drawing; None if an end is not finite, or all of them are equal.
     """
-    low = min(interval[2] for interval in intervals)
-    high = max(interval[3] for interval in intervals)
-    values = [number for interval in intervals for number in interval[1:]]
-    if not all(map(isfinite, values)) or high <= low:
+    low = min(begin for _, _, begin, _ in intervals)
+    high = max(end for _, _, _, end in intervals)
+    numbers = [number for _, *numbers in intervals for number in numbers]
+    if not all(map(isfinite, numbers)) or high <= low:
         return None
     scale = SCALE_WIDTH / (high - low)
 
@@ -83,6 +83,7 @@ def draw_intervals(
     )
     band_extent = None
     if band is not None:
+        left, right = map(to_pixels, band)
         # A narrow band is drawn 1.5 pixels wide, so that it remains visible.
-        band_extent = to_pixels(band[0]), max(to_pixels(band[1]) - to_pixels(band[0]), 1.5)
+        band_extent = left, max(right - left, 1.5)
     return IntervalDrawing(rows, distance * len(rows) + 2, distance / 4 + 0.5, band_extent)

@@ -188,6 +188,7 @@ def select_initial_rows(grid: DataGrid, frame: pd.DataFrame | Table) -> list[dic
     if not grid.sort:
         return rows
     name, _, direction = grid.sort.partition(",")
+    # Rows without a value come last in both directions.
     missing = [row for row in rows if is_missing(row[name])]
     present = [row for row in rows if not is_missing(row[name])]
     return sorted(present, key=lambda row: row[name], reverse=direction == "down") + missing

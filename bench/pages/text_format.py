@@ -76,6 +76,7 @@ def format_number(value: float | None, digits: int = 3) -> str:
     # Rounded first: 0.0009996 is 0.001, which needs no power of ten.
     rounded = float(f"{value:.{digits - 1}e}")
     exponent = _get_exponent(abs(rounded))
+    # Digits after the first one, less those before the decimal point.
     decimals = max(0, digits - 1 - floor(log10(abs(rounded))) + exponent)
     text = f"{_divide_by_power(rounded, exponent):.{decimals}f}"
     # Zeros before the decimal point are digits, trailing zeros after it are not needed.
@@ -109,8 +110,10 @@ def format_estimate(value: float, low: float | None, high: float | None) -> str:
         return f"{format_number(value)} (no interval)"
     # One power of ten for all three numbers makes them comparable at a glance.
     exponent = _get_exponent(max(abs(value), abs(low), abs(high)))
+    # Logarithm of the half width as it is written; its fraction is that of the mantissa.
     half = log10((high - low) / 2) - exponent
-    decimals = min(max(0, (half % 1 < _LOG_MAX_TWO_DIGIT_MANTISSA) - floor(half)), 9)
+    has_two_digits = half % 1 < _LOG_MAX_TWO_DIGIT_MANTISSA
+    decimals = min(max(0, has_two_digits - floor(half)), 9)
     texts = []
     for x in (value, low, high):
         digits = f"{_divide_by_power(x, exponent):.{decimals}f}"

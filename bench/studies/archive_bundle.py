@@ -196,6 +196,7 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
         total > _MIN_BYTES_FOR_RATIO_CHECK and total > MAX_COMPRESSION_RATIO * size
     ):
         raise _make_refusal(archive, f"it would unpack from {size} bytes to {total}")
+    # Such data are a comment at the end, or bytes before the first file.
     if packed.comment or min((e.header_offset for e in entries), default=0) > 0:
         raise _make_refusal(archive, "it contains data that belong to no file")
     return entries
@@ -237,15 +238,14 @@ def _find_top_folder(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
     Raises:
         InputError: the archive has another form, so it was not made by `simgap bundle`.
     """
-    tops = {entry.filename.partition("/")[0] for entry in entries}
-    if len(tops) != 1 or f"{(top := tops.pop())}/{MANIFEST_FILE}" not in {
-        e.filename for e in entries
-    }:
-        raise InputError(
-            f"{archive}: expected an archive of simgap bundle: one folder with {MANIFEST_FILE} "
-            "in it"
-        )
-    return top
+    paths = {entry.filename for entry in entries}
+    top_folders = {path.partition("/")[0] for path in paths}
+    for top_folder in top_folders:
+        if len(top_folders) == 1 and f"{top_folder}/{MANIFEST_FILE}" in paths:
+            return top_folder
+    raise InputError(
+        f"{archive}: expected an archive of simgap bundle: one folder with {MANIFEST_FILE} in it"
+    )
 
 
 def _read_manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any]:
@@ -426,7 +426,10 @@ def _list_plugin_files(folder: Path) -> dict[str, Path]:
 
 
 def _list_comparison_folders(folder: Path) -> Iterator[Path]:
-    """Yield the folders of the comparisons in a folder; a study of two has both in its own."""
+    """Yield the folders of the comparisons in a folder.
+
+    A misspecification study consists of two comparisons, in subfolders of its own folder.
+    """
     for part in list_study_folders(folder):
         models = [part / label for label in MODEL_LABELS if (part / label).is_dir()]
         yield from models or [part]

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.targets import Target
@@ -366,7 +367,7 @@ def _verify_tables(
         stored_table = stored_table.fillna({"range": "", "metric": ""}).sort_values(
             keys, kind="stable"
         )
-    lines = stored_table.index
+    row_numbers = stored_table.index  # rows of the file, in the order of comparison
     for column in expected:
         if column not in stored_table:
             failures.append(
@@ -375,20 +376,21 @@ def _verify_tables(
             continue
         expected_values = expected[column].reset_index(drop=True)
         found_values = stored_table[column].reset_index(drop=True)
-        if pd.api.types.is_numeric_dtype(expected_values) and expected_values.dtype != bool:
-            is_equal = np.isclose(
-                expected_values.astype(float),
-                found_values.astype(float),
-                rtol=_ARITHMETIC_TOLERANCE,
-                equal_nan=True,
-            )
-        else:
-            is_equal = (
-                expected_values.astype(str) == found_values.fillna("").astype(str)
-            ).to_numpy()
+        is_equal = _compare_columns(expected_values, found_values)
         if not is_equal.all():
-            place = int(np.argmin(is_equal))
-            message = f"{column}: expected {expected_values[place]}, found {found_values[place]}"
-            failures.append(VerificationFailure(path.name, int(lines[place]) + 2, message))
+            first = int(np.argmin(is_equal))
+            message = f"{column}: expected {expected_values[first]}, found {found_values[first]}"
+            # Line of the file: lines count from 1, and the first one is the header.
+            failures.append(VerificationFailure(path.name, int(row_numbers[first]) + 2, message))
     print_line(f"table.csv: {len(stored_table)} rows recomputed from runs.parquet")
     return failures
+
+
+def _compare_columns(expected: pd.Series, found: pd.Series) -> NDArray[np.bool_]:
+    """Return a mask (n,) of equal cells: numbers up to rounding, anything else as text."""
+    if pd.api.types.is_numeric_dtype(expected) and expected.dtype != bool:
+        return np.isclose(
+            expected.astype(float), found.astype(float), rtol=_ARITHMETIC_TOLERANCE, equal_nan=True
+        )
+    is_equal: NDArray[np.bool_] = (expected.astype(str) == found.fillna("").astype(str)).to_numpy()
+    return is_equal

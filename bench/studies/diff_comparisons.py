@@ -67,13 +67,13 @@ class ComparisonSide:
             k: number of simulations.
 
         Returns:
-            Errors by (target, seed); infinite if the run failed and has ended by then, or has no
-            error.
+            Errors by (target, seed); infinite for a run without an error, and after all simulations
+            also for one that failed.
         """
         part = self.curves.select(range=kind, tuner=tuner)
-        last = k >= part.values.shape[1] - 1
+        is_last = k >= part.values.shape[1] - 1
         errors = part.values[:, k]
-        is_failed = np.isnan(errors) | (part.failed & last)
+        is_failed = np.isnan(errors) | (part.failed & is_last)
         index = pd.MultiIndex.from_frame(part.keys[["target", "seed"]])
         return pd.Series(np.where(is_failed, np.inf, errors), index=index)
 
@@ -160,10 +160,12 @@ class ComparisonDiff:
             tuner: label of the tuner.
             k: number of simulations.
         """
+        # Errors by (target, seed).
         errors_a, errors_b = (side.index_errors(kind, tuner, k) for side in (self.a, self.b))
-        shared_targets = self.shared_targets
         common_keys = [
-            key for key in errors_a.index if key in errors_b.index and key[0] in shared_targets
+            (target, seed)
+            for target, seed in errors_a.index
+            if (target, seed) in errors_b.index and target in self.shared_targets
         ]
         is_paired = bool(common_keys)
         if is_paired:
@@ -173,20 +175,19 @@ class ComparisonDiff:
             compute_log_errors(np.asarray(errors, dtype=np.float64)) for errors in target_means
         )
         if is_paired:
-            count, _, _, ratio, p_value = compare_pair(log_errors_b, log_errors_a)
+            test = compare_pair(log_errors_b, log_errors_a)
+            count, ratio, p_value = test.targets, test.ratio, test.p_value
         else:
-            count, ratio, p_value = (
-                min(len(log_errors_a), len(log_errors_b)),
-                *_compare_unpaired(log_errors_a, log_errors_b),
-            )
-        medians = [float(errors.median()) for errors in target_means]
+            count = min(len(log_errors_a), len(log_errors_b))
+            ratio, p_value = _compare_unpaired(log_errors_a, log_errors_b)
+        median_a, median_b = (float(errors.median()) for errors in target_means)
         return {
             "range": kind,
             "tuner": tuner,
             "simulations": k,
             "metric": self.metric,
-            "median_a": medians[0],
-            "median_b": medians[1],
+            "median_a": median_a,
+            "median_b": median_b,
             "ratio": ratio,
             "targets": count,
             "paired": is_paired,
@@ -222,15 +223,19 @@ class ComparisonDiff:
 
         A status is the way a run ended, such as finished, failed or timed out.
         """
-        counts = [
+        counts_a, counts_b = (
             Counter(zip(s.stored.statuses["tuner"], s.stored.statuses["status"], strict=True))
             for s in (self.a, self.b)
-        ]
+        )
         return [
-            {"tuner": tuner, "status": status, "a": counts[0][key], "b": counts[1][key]}
-            for key in sorted({*counts[0], *counts[1]})
-            if counts[0][key] != counts[1][key]
-            for tuner, status in [key]
+            {
+                "tuner": tuner,
+                "status": status,
+                "a": counts_a[tuner, status],
+                "b": counts_b[tuner, status],
+            }
+            for tuner, status in sorted({*counts_a, *counts_b})
+            if counts_a[tuner, status] != counts_b[tuner, status]
         ]
 
     @cached_property
@@ -267,24 +272,24 @@ class ComparisonDiff:
         frames = [s.stored.statuses for s in (self.a, self.b)]
         for tuner in self.a.curves.list_tuners():
             if tuner not in self.unshared_tuners["a"]:
-                failure_shares = [
+                share_a, share_b = (
                     f.loc[f["tuner"] == tuner, "status"].isin(FAILED_OR_SKIPPED_STATUSES).mean()
                     for f in frames
-                ]
-                yield float(failure_shares[0]), float(failure_shares[1])
+                )
+                yield float(share_a), float(share_b)
 
     def _list_shown_statuses(self) -> list[dict[str, Any]]:
         """List the changed status counts that are printed.
 
         Counts other than failures are included only if both comparisons have the same number of
-        runs of the tuner.
+        runs of the tuner; otherwise they differ in any case.
         """
-        runs = [s.stored.statuses["tuner"].value_counts() for s in (self.a, self.b)]
+        runs_a, runs_b = (s.stored.statuses["tuner"].value_counts() for s in (self.a, self.b))
         return [
             change
             for change in self.statuses
             if change["status"] in FAILED_OR_SKIPPED_STATUSES
-            or runs[0].get(change["tuner"]) == runs[1].get(change["tuner"])
+            or runs_a.get(change["tuner"]) == runs_b.get(change["tuner"])
         ]
 
     @cached_property
@@ -369,11 +374,15 @@ def _compare_unpaired(a: Array, b: Array) -> tuple[float, float]:
 
 
 def _compute_min_attainable_p_value(targets: int, paired: bool) -> float:
-    """Compute the smallest p-value that is possible with a number of targets.
+    """Compute the smallest two-sided p-value that is possible with a number of targets.
+
+    It is reached if one comparison is better on all of them: of the 2^n signs of n differences
+    (Wilcoxon's signed-rank test), or of the (2n over n) orders of two samples (Mann-Whitney test),
+    only two are so extreme.
 
     Args:
-        targets: number of targets of each comparison.
-        paired: whether both comparisons have the same targets (sign test), or not (rank test).
+        targets: number n of targets of each comparison.
+        paired: whether both comparisons have the same targets.
     """
     from math import comb
 

@@ -254,6 +254,7 @@ class ExplanationDiff:
 
         A candidate that one of the explanations does not rank has None as its score and rank there.
         """
+        # Rank and score of each candidate by its effect, for both explanations.
         ranked = [
             {c.effect: (rank, c.score) for rank, c in enumerate(side.verdict.candidates, 1)}
             for side in (self.a, self.b)
@@ -371,12 +372,16 @@ def _compute_p_value(row: Mapping[str, Any]) -> float:
     Args:
         row: Values `a` and `b` with the limits `low_a`, `high_a`, `low_b` and `high_b`.
     """
-    limits = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
-    if any(end is None for end in limits):
+    numbers = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
+    if any(number is None for number in numbers):
         return math.nan
-    errors = [(row[f"high_{m}"] - row[f"low_{m}"]) / (2 * _NORMAL_95) for m in ("a", "b")]
-    spread = math.hypot(*errors)
+    standard_errors = [
+        (row[f"high_{side}"] - row[f"low_{side}"]) / (2 * _NORMAL_95) for side in ("a", "b")
+    ]
     difference = abs(row["a"] - row["b"])
-    if spread == 0:
+    # Standard error of the difference of two independent numbers.
+    difference_error = math.hypot(*standard_errors)
+    if difference_error == 0:
         return 1.0 if difference == 0 else 0.0
-    return math.erfc(difference / spread / math.sqrt(2))
+    # Two-sided tail of the normal distribution.
+    return math.erfc(difference / difference_error / math.sqrt(2))

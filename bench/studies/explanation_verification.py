@@ -223,6 +223,7 @@ def _score_extended_model(
         verification.unchecked.append(f"held-out error: {str(error).replace(f'{folder}/', '')}")
         return
     assert verdict.heldout is not None
+    # The stated error is the root mean square over the channels that have its unit.
     units = result["units"]
     errors_in_unit = [
         e for name, e in result["rmse"].items() if units[name] == verdict.heldout.unit

@@ -165,11 +165,11 @@ class ComparisonCollection:
 
         Common tuners are those that every comparison has.
         """
-        problem_errors = pd.concat(
+        problem_ranks = pd.concat(
             [compute_problem_ranks(part.curves, part.floor) for part in self.parts]
         )
-        # Ranks among all tuners have gaps if some tuners are left out.
-        return problem_errors[list(self.tuners)].rank(axis=1)
+        # Ranks among all tuners of a comparison have gaps if some tuners are left out.
+        return problem_ranks[list(self.tuners)].rank(axis=1)
 
     @property
     def has_enough_problems(self) -> bool:
@@ -234,8 +234,8 @@ class ComparisonCollection:
     def _draw_runtime_distribution(self) -> Figure:
         """Draw the runtime distribution over all problems.
 
-        It is the share of solved targets against the number of simulations. The tuners are ordered
-        by mean rank.
+        It is the share of pairs (run, error threshold) that are reached within a share of the
+        problem's budget. The tuners are ordered by mean rank.
         """
         panel, table = self.make_runtime_panel()
         figure, axes = draw_chart([panel], {panel.table: table})
@@ -385,7 +385,8 @@ def render_multi_problem_page(
     undecided_tuners: list[str] = []
     if p_values is not None:
         for tuner, p_value in p_values[best].drop(best).items():
-            (significantly_worse if p_value < SIGNIFICANCE else undecided_tuners).append(str(tuner))
+            is_significant = p_value < SIGNIFICANCE
+            (significantly_worse if is_significant else undecided_tuners).append(str(tuner))
     return page.render(
         _TEMPLATE,
         tuners=collection.tuners,

@@ -269,6 +269,7 @@ def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[
             if not np.isfinite(rank):
                 entries.append({"text": "", "kind": "", "anchor": anchor, "title": ""})
                 continue
+            # 0 for the best method of the cell, 1 for the worst.
             share = (rank - 1.0) / max(int(counts[cell]) - 1, 1)
             colour = min(int(share * _RANK_CLASSES), _RANK_CLASSES - 1)
             failures = int(errors["failures"][cell, tuner])

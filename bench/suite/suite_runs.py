@@ -227,7 +227,7 @@ def name_cell(problem: str, kind: str, condition: str, experiment: Experiment) -
     Args:
         problem: name of the problem.
         kind: range of the targets.
-        condition: condition that distinguishes the cell, such as a noise; empty for none.
+        condition: ``before`` or ``after`` the extension of a misspecified simulator, else empty.
         experiment: configuration of the problem, with its ranges.
     """
     if condition:
@@ -299,18 +299,20 @@ def merge_runs(new_runs: SuiteRuns, stored: SuiteRuns) -> SuiteRuns:
         stored: runs of any tuners; those of a tuner that `new_runs` has in the same cell are left
             out.
     """
-    own_places, stored_places = (
+    # The cell and target of each run.
+    own_targets, stored_targets = (
         pd.MultiIndex.from_frame(part.runs[["cell", "target"]]) for part in (new_runs, stored)
     )
-    common = own_places.isin(stored_places)
-    if not common.any():
+    is_common = own_targets.isin(stored_targets)
+    if not is_common.any():
         return new_runs
-    own_pairs = pd.MultiIndex.from_frame(new_runs.runs[["cell", "tuner"]])
-    is_added = stored_places.isin(own_places)
-    is_added &= ~pd.MultiIndex.from_frame(stored.runs[["cell", "tuner"]]).isin(own_pairs)
+    own_tuners, stored_tuners = (
+        pd.MultiIndex.from_frame(part.runs[["cell", "tuner"]]) for part in (new_runs, stored)
+    )
+    is_added = stored_targets.isin(own_targets) & ~stored_tuners.isin(own_tuners)
     return concatenate(
         [
-            new_runs.select(pd.Series(common, index=new_runs.runs.index)),
+            new_runs.select(pd.Series(is_common, index=new_runs.runs.index)),
             stored.select(pd.Series(is_added, index=stored.runs.index)),
         ]
     )

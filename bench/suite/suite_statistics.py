@@ -119,13 +119,14 @@ class SuiteTables:
         """
         start_errors = {}
         for cell, by_tuner in self.curves.items():
-            errors = [pd.Series(dtype=float)]
-            errors += [
+            errors = [
                 pd.Series(curves.values[:, 0], index=curves.keys["target"])
                 for tuner, curves in by_tuner.items()
                 if not self._get_training_share(cell, tuner)
             ]
-            start_errors[cell] = pd.concat(errors[1:] or errors).groupby(level=0).min()
+            # Empty if all tuners of the cell are trained.
+            errors = errors or [pd.Series(dtype=float)]
+            start_errors[cell] = pd.concat(errors).groupby(level=0).min()
         return start_errors
 
     def _get_training_share(self, cell: str, tuner: str) -> float:
@@ -156,6 +157,14 @@ class SuiteTables:
         }
 
     def _compute_medians(self, k: int, training: str) -> pd.DataFrame:
+        """Compute median log errors over targets: a row per cell, a column per tuner.
+
+        A tuner that lacks a run on some target of a cell has no median (NaN) there.
+
+        Args:
+            k: number of simulations.
+            training: `FREE` or `COUNTED`.
+        """
         medians = {}
         for cell, by_tuner in self._target_means.items():
             logs = pd.DataFrame(
@@ -164,7 +173,7 @@ class SuiteTables:
                     for t, means in by_tuner.items()
                 }
             )
-            # NaN where the tuner has no run on a target.
+            # NaN where the tuner has no run on a target. `np.median` keeps it; pandas would not.
             values: Array = logs.to_numpy(dtype=np.float64)
             medians[cell] = pd.Series(np.median(values, axis=0), index=logs.columns)
         frame = pd.DataFrame(medians).T
@@ -284,7 +293,7 @@ class SuiteTables:
         for row in self.suite.cells.itertuples():
             cell = str(row.cell)
             levels: tuple[float, ...] = ERROR_LEVELS
-            if row.range == "real":
+            if row.range == "real":  # recorded data
                 levels = tuple(f * self._smallest_errors[cell] for f in MEASURED_LEVELS)
             for tuner, curves in self.curves[cell].items():
                 # Beyond the end of a smaller budget nothing is known.
@@ -351,7 +360,9 @@ class SuiteTables:
         yield "data", "robot from a model file", find_tagged("robot")
 
     def find_losses(self, tuner: str, k: int, factor: float) -> pd.DataFrame:
-        """Find the cells in which a tuner's error is larger than the best one's by a factor.
+        """Find the cells in which a tuner's median error exceeds the smallest one by a factor.
+
+        A cell is a problem with one range of targets.
 
         Args:
             tuner: label of the tuner.
@@ -362,6 +373,7 @@ class SuiteTables:
             Columns cell, winner and ratio; the largest ratio first.
         """
         medians = self.get_medians(k)
+        # Differences of logarithms are logarithms of ratios.
         excess = medians[tuner] - medians.min(axis=1)
         # exp(700) is close to the largest finite number.
         ratios = np.exp(excess.clip(upper=700.0))
@@ -421,9 +433,11 @@ def choose_segments(means: pd.DataFrame) -> list[tuple[str, int]]:
     checkpoints = [int(str(k)) for k in means]
     segments, start = [], 0
     while start < len(checkpoints):
+        # Number of checkpoints from `start` on at which each method stays near the best.
         segment_lengths = is_near_best.iloc[:, start:].cumprod(axis=1).sum(axis=1)
         longest = segment_lengths.index[segment_lengths == segment_lengths.max()]
         stop = start + int(segment_lengths.max())
+        # Of the methods that stay longest, the one with the lowest mean rank meanwhile.
         tuner = str(means.loc[longest, checkpoints[start:stop]].mean(axis=1).idxmin())
         segments.append((tuner, checkpoints[stop - 1]))
         start = stop
@@ -433,8 +447,13 @@ def choose_segments(means: pd.DataFrame) -> list[tuple[str, int]]:
 def build_guide(tables: SuiteTables) -> pd.DataFrame:
     """Build the decision guide: the best method for each kind of problem and budget.
 
+    Args:
+        tables: statistics of the suite, with mean ranks over all problems and by property.
+
     Returns:
-        Columns `GUIDE_COLUMNS`: best of all methods, and best of those that need no training.
+        Columns `GUIDE_COLUMNS`: property of problems and its value, number of cells (problems with
+        one range of targets), number of simulations, best of all methods, and best of those that
+        need no training.
     """
     trained = tables.get_trained_tuners()
     lines = []
