@@ -76,6 +76,7 @@ class Comparison(Study):
         from bench.benchmark.runner.experiment_runner import prepare_experiment
 
         results = prepare_experiment(new.experiment, new.secret)
+        # A comparison opens an existing folder.
         comparison = cls(new.create_folder(results.redraws))
         comparison._attach(results)
         return comparison

@@ -258,7 +258,9 @@ def has_both_comparisons(folder: Path) -> bool:
 
 
 def _write_comparison_tables(folder: Path, print_line: PrintLine) -> int:
-    """Write the tables of the comparisons that exist.
+    """Write the tables of the comparisons in both simulators, and print their failures.
+
+    A comparison that has no runs yet is left out.
 
     Args:
         folder: folder of the study.

@@ -45,7 +45,9 @@ _MARKED_POINTS = 11
 
 
 def select_first_panels(panels: Iterable[Panel], shown: Collection[str]) -> list[Panel]:
-    """Select the panels of a printed figure.
+    """Select the panels of a printed figure, which cannot be switched as on a page.
+
+    A facet is a property that distinguishes panels, such as the range of targets.
 
     Args:
         panels: Panels of the chart.
@@ -87,6 +89,7 @@ def draw_chart(
     columns = columns or max(len(panels), 1)
     row_count = max(-(-len(panels) // columns), 1)  # rounded up
     width, height = size or PANEL_SIZE
+    # Axes are shared if all panels declare the same ones.
     shared = all(
         panel.up == panels[0].up and (not horizontal or panel.across == panels[0].across)
         for panel in panels

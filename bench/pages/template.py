@@ -203,6 +203,8 @@ class CompiledTemplates(FileSystemBytecodeCache):
     def dump_bytecode(self, bucket: Bucket) -> None:
         """Store the compiled code of a template on disk, for reuse in the next process.
 
+        Nothing is stored if Python may not write bytecode, or if the folder cannot be written to.
+
         Args:
             bucket: Jinja2's compiled template.
         """

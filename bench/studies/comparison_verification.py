@@ -94,7 +94,9 @@ def verify_comparison(
 ) -> VerificationResult:
     """Verify a finished comparison, and print the result.
 
-    Checked are the hashes, the salt, a sample of the simulations, and the tables.
+    The salt, from which the targets were drawn, must be the one that was committed by its hash
+    before the first run. Errors, a sample of the simulated losses, and the tables are computed
+    again.
 
     Args:
         folder: folder of the comparison.
@@ -203,6 +205,7 @@ def _verify_runs_table(
     for name, rows in checked_rows.groupby("target", sort=False):
         doubts += _verify_losses(problem, targets[str(name)], rows)
     print_line(f"runs.parquet: {len(checked_rows)} of {len(runs)} rows simulated again")
+    # Rows must say whether the tuners ran without isolation; the first wrong one is reported.
     doubts += [
         VerificationFailure(
             "runs.parquet", int(row) + 1, f"trusted: expected {problem.experiment.trusted}"

@@ -99,6 +99,7 @@ def format_diff(document: Mapping[str, Any], **values: Any) -> list[str]:
         document: differences between two comparisons or two explanations.
         **values: further values of the template.
     """
+    # Lists of changes that only one of the two kinds of documents has.
     changes: dict[str, Any] = {"configuration": (), "environment": (), "settings": ()}
     return render_text(_TEMPLATE, **{**changes, **document, **values}, max_changes=_MAX_CHANGES)
 

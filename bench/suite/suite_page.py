@@ -46,7 +46,10 @@ MAX_PRINTED_RATIO = 1e4
 
 
 def build_headline(tables: SuiteTables) -> str:
-    """Build one sentence that a practitioner can act on."""
+    """Build one or two sentences that say which method to use up to which number of simulations.
+
+    Ranks do not count the cost of training; so methods without training are named too.
+    """
     ranks = tables.ranks[tables.ranks["training"] == FREE]
     mean_ranks = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
     untrained = mean_ranks[~mean_ranks.index.isin(tables.get_trained_tuners())]
@@ -171,7 +174,8 @@ def render_suite_page(tables: SuiteTables) -> str:
     seed_counts = suite.runs.groupby(["cell", "tuner", "target"])["seed"].nunique()
     seeds = int(seed_counts.max())
     trained = suite.training[suite.training["fit_simulations"] > 0]
-    ranked = bool(tables.complete_tuners)
+    # Only methods with results in every cell (problem with one range of targets) are ranked.
+    has_ranking = bool(tables.complete_tuners)
     partial_tuners = [t for t in suite.tuners if t not in tables.complete_tuners]
     return page.render(
         _TEMPLATE,
@@ -180,10 +184,10 @@ def render_suite_page(tables: SuiteTables) -> str:
         problem_count=suite.cells["problem"].nunique(),
         targets=_join_range(targets),
         seeds=f"{_join_range(seed_counts)} seed{'' if seeds == 1 else 's'}",
-        headline=build_headline(tables) if ranked else "No method has results in all cells.",
+        headline=build_headline(tables) if has_ranking else "No method has results in all cells.",
         tests=describe_tests(tables),
         guide_checkpoints=[k for k in _GUIDE_CHECKPOINTS if k in tables.checkpoints],
-        guide=_build_guide_rows(tables) if ranked else [],
+        guide=_build_guide_rows(tables) if has_ranking else [],
         losses=describe_losses(tables),
         loss_factor=f"{LOSS_FACTOR:g}",
         cells=_build_cells(tables, page, styles),
@@ -194,7 +198,7 @@ def render_suite_page(tables: SuiteTables) -> str:
         ],
         partial_tuners=partial_tuners,
         skipped=[f"{row.tuner}: {row.reason}" for row in suite.skipped.itertuples()],
-        rank_panel=_make_rank_panel(tables, page, styles) if ranked else None,
+        rank_panel=_make_rank_panel(tables, page, styles) if has_ranking else None,
         columns={name: _list_columns(frame) for name, frame in shown_frames.items()},
         filters={
             name: tuple(column for column in _FILTERED_COLUMNS if column in frame)
@@ -310,8 +314,8 @@ def _build_cells(
     cells = []
     for row in tables.suite.cells.itertuples():
         cell = str(row.cell)
-        present = {name: look for name, look in styles.items() if name in tables.curves[cell]}
-        series = make_method_series(present, "tuner", "median", where={"cell": cell})
+        cell_styles = {name: look for name, look in styles.items() if name in tables.curves[cell]}
+        series = make_method_series(cell_styles, "tuner", "median", where={"cell": cell})
         unit = "held-out RMSE" if row.range == "real" else "error [training widths]"
         panel = Panel(cell, "curves", "simulations", series, x_axis, Axis(f"{unit}, median", "log"))
         anchor = _make_anchor(cell)
@@ -337,8 +341,8 @@ def _make_rank_panel(tables: SuiteTables, page: HtmlPage, styles: dict[str, Mark
         styles: styles of marks by name of the tuner.
     """
     page.add_table("mean-ranks", tables.ranks[tables.ranks["training"] == FREE], _DIGITS)
-    present = {name: look for name, look in styles.items() if name in tables.complete_tuners}
-    series = make_method_series(present, "tuner", "mean_rank")
+    ranked_styles = {name: look for name, look in styles.items() if name in tables.complete_tuners}
+    series = make_method_series(ranked_styles, "tuner", "mean_rank")
     ticks = tuple(float(k) for k in tables.checkpoints)
     x_axis = Axis("simulations used on the target", "log", ("log", "linear"), ticks)
     y_axis = Axis("mean rank, 1 is best", scales=("linear",))

@@ -357,10 +357,13 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
 
 
 def _encode_errors(errors: Array) -> dict[str, Any]:
-    """Return the columns that store errors (R, K + 1): only where they change, in decimal digits.
+    """Encode the errors of runs for storage: run-length encoding of rounded decimal numbers.
 
-    An error hardly changes from one simulation to the next, and few errors of two runs are equal.
-    An error is mantissa * 10 ** (exponent - `_STORED_DIGITS` + 1).
+    An error often stays the same for many simulations, and is stored only where it changes. It is
+    mantissa * 10 ** (exponent - `_STORED_DIGITS` + 1).
+
+    Args:
+        errors: (R, K + 1) errors of R runs after 0..K simulations; NaN and infinity are allowed.
 
     Returns:
         Columns of one list for each run: for how many simulations an error holds, its mantissa and
@@ -371,7 +374,7 @@ def _encode_errors(errors: Array) -> dict[str, Any]:
     with np.errstate(divide="ignore", invalid="ignore"):
         exponents = np.floor(np.log10(np.abs(errors)))
     is_number = np.isfinite(errors) & np.isfinite(exponents)
-    # A smaller error counts as zero.
+    # An error below the smallest exponent is rounded to zero.
     exponents = np.where(is_number, np.maximum(exponents, _MIN_EXPONENT), 0.0)
     shifted = np.where(is_number, errors, 0.0) * 10.0 ** (_STORED_DIGITS - 1 - exponents)
     mantissas = np.round(shifted).astype(np.int16)
@@ -379,8 +382,10 @@ def _encode_errors(errors: Array) -> dict[str, Any]:
     exponents[np.isnan(errors)], exponents[np.isposinf(errors)] = _MISSING, _FAILED
     has_changed = np.ones(errors.shape, dtype=bool)
     has_changed[:, 1:] = (np.diff(mantissas, axis=1) != 0) | (np.diff(exponents, axis=1) != 0)
+    # Positions in the flattened array at which an error begins to hold.
     starts = np.flatnonzero(has_changed)
     lengths = np.diff(starts, append=errors.size).astype(np.int16)
+    # List r of a column has its elements offsets[r] to offsets[r + 1].
     offsets = np.concatenate([[0], np.cumsum(has_changed.sum(axis=1))]).astype(np.int32)
     values = lengths, mantissas[has_changed], exponents[has_changed]
     return {

@@ -264,6 +264,7 @@ class SuiteTables:
         cost.
         """
         lines = []
+        # The key is `FREE` or `COUNTED` training, and the number of simulations.
         for key, all_medians in self._medians.items():
             medians = all_medians[self.complete_tuners]
             if medians.shape[1] < 2:
@@ -335,7 +336,9 @@ class SuiteTables:
     def _list_properties(self) -> Iterator[tuple[str, str, pd.Series[bool]]]:
         """Yield each property of problems with one of its values, and a mask of cells with it.
 
-        The properties are the numbers of parameters, noise, range, simulator and data.
+        A cell is a problem with one range of targets: "in" the training range, "wide", or "real"
+        for recorded data. A misspecified simulator is tuned "before" and "after" its extension by
+        the missing effect.
         """
         cells = self.suite.cells
         tags = cells["tags"].str.split(";")
@@ -345,7 +348,7 @@ class SuiteTables:
         def find_tagged(tag: str) -> pd.Series[bool]:
             return tags.map(lambda words: tag in words).astype(bool)
 
-        # Once explain has extended a simulator, nothing is missing any more.
+        # An extended simulator lacks no effect any more.
         misspecified = find_tagged("misspecified") & (kind != "after")
         yield "parameters", "1", dimension == 1
         yield "parameters", "2 or 3", (dimension > 1) & (dimension <= 3)

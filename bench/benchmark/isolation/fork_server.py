@@ -70,6 +70,9 @@ def serve_fork_requests(descriptor: int) -> None:
 
     Each request names modules to import, and may ask for a new process, which this process forks.
     The fork becomes a supervisor; this process continues with the next request.
+
+    Args:
+        descriptor: file descriptor of the socket to the client.
     """
     link = socket.socket(fileno=descriptor)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -91,6 +94,7 @@ def serve_fork_requests(descriptor: int) -> None:
             for descriptor_copy in descriptors:
                 os.close(descriptor_copy)
             link.sendall(b"K")
+    # The server works in a scratch folder of its own.
     shutil.rmtree(os.getcwd(), ignore_errors=True)
 
 
@@ -176,8 +180,8 @@ def _wait_for_child(child: int, control: int) -> int:
 def _run_service(request: dict[str, Any], pipes: list[int], layers: list[str]) -> None:
     """Apply the last isolation layers, and run the service, such as that of a tuner.
 
-    The two pipes become the descriptors 100 and 101. All others are closed, so that code of a tuner
-    cannot reach anything of the harness through an open file.
+    The two pipes become the descriptors 100 and 101. All others but the standard streams are
+    closed, so that code of a tuner cannot reach anything of the harness through an open file.
 
     Args:
         request: What to run (`service`, as "module:function"), and the folder, readable paths and

@@ -266,10 +266,12 @@ def restrict_file_access(readable: Iterable[str], writable: Iterable[str]) -> No
     if not version:
         raise OSError("the kernel has no Landlock")
     all_rights = sum(rights for min_version, rights in _LANDLOCK_ALL if min_version <= version)
-    network = _LANDLOCK_TCP if version >= 4 else 0
-    scope = _LANDLOCK_SCOPE if version >= 6 else 0
-    # Each version extended the structure, and the kernel accepts the shorter ones.
-    fields = (all_rights, network, scope)[: 1 + (version >= 4) + (version >= 6)]
+    # Versions 4 and 6 extended the structure, and the kernel accepts the shorter ones.
+    fields = [all_rights]
+    if version >= 4:
+        fields.append(_LANDLOCK_TCP)
+    if version >= 6:
+        fields.append(_LANDLOCK_SCOPE)
     attributes = struct.pack(f"<{len(fields)}Q", *fields)
     size = ctypes.c_size_t(len(attributes))
     rules = call_system(_LANDLOCK_CREATE, attributes, size, ctypes.c_uint32(0))

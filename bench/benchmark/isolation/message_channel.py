@@ -74,10 +74,10 @@ class Message(NamedTuple):
     body: memoryview
 
     def to_array(self) -> Array:
-        """Return the body as a new array (n,).
+        """Return the body, which consists of n float64 numbers, as a new array (n,).
 
         Raises:
-            ProtocolError: its size is not that of an array.
+            ProtocolError: its size is not a multiple of that of a number.
         """
         if len(self.body) % 8:  # bytes per float64
             raise ProtocolError("it sent an incomplete number")

@@ -106,7 +106,7 @@ class IsolatedProcess:
         return self._open
 
     def wait_until_ready(self) -> None:
-        """Wait until the process is ready.
+        """Wait until the process is ready; it then reports its active isolation layers.
 
         Raises:
             KilledExternallyError: the process did not start.

@@ -108,6 +108,7 @@ def _parse_tuner_table(path: Path, entry_key: str, label: str, value: Any) -> Tu
         label: label under which results are listed.
         value: the table.
     """
+    # The keys of the table are the fields of `TunerEntry`, except for the label.
     hints = {key: hint for key, hint in get_type_hints_of(TunerEntry).items() if key != "label"}
     table = check_entries(path, entry_key, value, hints)
     for key in ("seeds", "budget"):
@@ -277,6 +278,12 @@ def check_problem_hash(
     suite: str, expected: Mapping[str, str], name: str, computed_hash: str
 ) -> None:
     """Raise an error if a problem is not the one that belongs to a suite's version.
+
+    Args:
+        suite: name and version of the suite.
+        expected: hash of each problem by its name, as the file of the suite states them.
+        name: name of the problem.
+        computed_hash: hash of the problem's present files.
 
     Raises:
         InputError: the hash is another one, or the suite states none.

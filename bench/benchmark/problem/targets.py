@@ -256,13 +256,18 @@ def _draw_value(rng: np.random.Generator, value: FixedOrRange) -> float:
     return rng.uniform(*value) if isinstance(value, tuple) else value
 
 
-def _simulate_held_out(problem: TargetProblem, theta: Array, target: TargetStreams) -> ObservedRuns:
+def _simulate_held_out(
+    problem: TargetProblem, theta: Array, target_streams: TargetStreams
+) -> ObservedRuns:
     """Simulate the held-out scenarios of a target, without sensor noise.
 
     Args:
         problem: problem of the experiment.
-        theta: (1, p) parameters of the target.
-        target: random streams of the target; the scenarios depend on nothing else.
+        theta: (1, p) true parameters of the target.
+        target_streams: random streams of the target, which determine the scenarios.
+
+    Returns:
+        Scenarios and observations; none if the experiment has no held-out scenarios.
     """
     experiment, held_out = problem.experiment, problem.experiment.held_out
     if held_out is None:
@@ -270,7 +275,7 @@ def _simulate_held_out(problem: TargetProblem, theta: Array, target: TargetStrea
     initial = {**experiment.initial, **held_out.initial}
     inputs = {**experiment.inputs, **held_out.inputs}
     # Each scenario has its own stream, so that more scenarios do not change the first ones.
-    streams = [target.get_held_out_stream(i) for i in range(held_out.scenarios)]
+    streams = [target_streams.get_held_out_stream(i) for i in range(held_out.scenarios)]
     scenarios = tuple(draw_scenario(experiment, rng, initial, inputs) for rng in streams)
     observed = [problem.world.simulate(theta, scenario)[0] for scenario in scenarios]
     return ObservedRuns(scenarios, np.concatenate(observed))

@@ -233,9 +233,9 @@ def _list_source_classes(kind: type) -> list[type]:
     waiting = [kind]
     while waiting:
         for part in waiting.pop().__mro__:
-            # Classes of the standard library are determined by the version of Python. A base that
-            # only describes an interface is found there. A class that a metaclass made only names
-            # such a module.
+            # Classes of the standard library, such as `ABC`, are determined by the version of
+            # Python. A class that a metaclass made may name a module there, but is not defined in
+            # it.
             if part in classes or (_is_standard_library(part) and _is_defined_in_module(part)):
                 continue
             classes.append(part)
@@ -255,9 +255,9 @@ def _get_top_level_package(kind: type) -> str:
 def _is_defined_in_module(kind: type) -> bool:
     """Return whether the module that a class names contains this class under its name.
 
-    Only then is the module's source the source of the class. Two examples are otherwise: a function
-    may make many classes from one source, each with other values; and a class that is made by
-    ``type(...)`` from an abstract class names `abc` as its module.
+    Only then is the module's source the source of the class. Counterexamples are classes that a
+    function makes from one source with different values, and a class that ``type(...)`` makes from
+    an abstract class, which names `abc` as its module.
     """
     attribute: Any = sys.modules.get(kind.__module__)
     for name in kind.__qualname__.split("."):

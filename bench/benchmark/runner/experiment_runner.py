@@ -63,15 +63,15 @@ class MemoryRunSink:
         self.columns: dict[int, Mapping[str, Any]] = {}
         self.statuses: dict[int, RunStatus] = {}
 
-    def append(self, place: int, columns: Mapping[str, Any], status: RunStatus) -> None:
+    def append(self, plan_index: int, columns: Mapping[str, Any], status: RunStatus) -> None:
         """Store the rows and the status of a finished run.
 
         Args:
-            place: index of the run in the plan.
-            columns: rows of runs.parquet.
+            plan_index: index of the run in the plan.
+            columns: rows of runs.parquet, by column.
             status: status of the run.
         """
-        self.columns[place], self.statuses[place] = columns, status
+        self.columns[plan_index], self.statuses[plan_index] = columns, status
 
 
 @dataclass

@@ -115,7 +115,7 @@ _known_plugins: dict[str, Plugin] = {}
 
 
 def load_plugins_for_experiment(paths: Sequence[str], experiment: Experiment) -> None:
-    """Load plugin files before an experiment runs, or only register descriptions of their parts.
+    """Load plugin files before an experiment runs, or only register descriptions of their tuners.
 
     This process has the true parameters, so code of a tuner must not run in it. A file with a
     simulator or an effect that is needed is loaded. Other files are inspected in an isolated

@@ -66,14 +66,14 @@ def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[
     # the configuration from the beginning.
     public = experiment.chosen(salt="") if experiment.salt_sha256 else experiment
     compared_parts = "diagnosers" if experiment.diagnosis else "simulator and tuners"
+    model_hash = {}
+    if experiment.model:
+        model_source = hash_class_source(get_simulator_class(experiment))
+        model_hash = {"model file": compute_digest(model_source)}
     return {
         "configuration": compute_digest(experiment.name, public.document()),
         "recording": compute_digest(hash_recording(experiment)),
-        **(
-            {"model file": compute_digest(hash_class_source(get_simulator_class(experiment)))}
-            if experiment.model
-            else {}
-        ),
+        **model_hash,
         "plugins": hash_plugin_files(plugins),
         "code": hash_source_folders(_get_source_folders(experiment)),
         "package versions": hash_package_versions(),

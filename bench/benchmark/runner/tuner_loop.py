@@ -68,7 +68,15 @@ class RunTrace:
         """
         no_values = np.empty(0)
         points = start[None]
-        return cls(status, reason, points[:0], no_values, points, no_values, no_values)
+        return cls(
+            status=status,
+            reason=reason,
+            proposals=points[:0],
+            losses=no_values,
+            recommendations=points,
+            tuner_seconds=no_values,
+            simulator_seconds=no_values,
+        )
 
 
 class _DivergenceError(Exception):

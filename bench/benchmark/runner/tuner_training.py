@@ -263,6 +263,7 @@ def compute_training_key(experiment: Experiment, entry: TunerEntry, seed: int) -
         hash_effect_sources(experiment.settings),
         hash_source_folders(),
         hash_package_versions(),
+        # Effects with random coefficients act only if the entry trains with them.
         *([dict(experiment.nuisance)] if entry.randomised else []),
         length=16,
     )

@@ -112,6 +112,7 @@ def compute_tuning_costs(
     for tuner in curves.list_tuners():
         mask = (curves.keys["tuner"] == tuner).to_numpy(dtype=bool)
         effort = compute_effort(curves.select_mask(mask), threshold, budget, tuner_seconds[mask])
+        # The last column has the total of each run.
         seconds_per_simulation = float(
             simulator_seconds[mask][:, -1].sum() / max(curves.used[mask].sum(), 1)
         )
@@ -264,13 +265,15 @@ def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) 
 def map_break_even_counts(table: pd.DataFrame) -> pd.DataFrame:
     """Map counts of `build_break_even_table` to a logarithmic axis from `AT_ONCE` to `NEVER`.
 
+    A count of 0 (training pays at once) becomes `AT_ONCE`, a count of 10^4 or more `NEVER`. Counts
+    between 0 and 1 become 1.
+
     Args:
         table: Counts of targets after which a training has paid, with intervals.
     """
     mapped_table = table.copy()
     for column in ("targets", "low", "high"):
         values = table[column].to_numpy(dtype=np.float64)
-        # Counts below one become one; counts beyond the axis are put at its end.
         clipped_values = np.where(values < 1e4, np.maximum(values, 1.0), NEVER)
         mapped_table[column] = np.where(values == 0, AT_ONCE, clipped_values)
     return mapped_table

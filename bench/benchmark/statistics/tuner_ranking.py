@@ -364,18 +364,19 @@ def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgre
     # (2, targets, tuners)
     ranks = np.stack([_rank_within_targets(first), _rank_within_targets(second)])
     count = ranks.shape[1]
+    # Tau of the mean ranks (tuners,) in both conditions.
     observed = compute_kendall_tau(*ranks.mean(axis=1))
     resamples = rng.integers(count, size=(BOOTSTRAP_RESAMPLES, count))
     resampled_taus = [compute_kendall_tau(*ranks[:, rows].mean(axis=1)) for rows in resamples]
     low, high = (np.nan, np.nan)
     if count > 1:
         low, high = np.nanquantile(resampled_taus, INTERVAL_QUANTILES)
-    # Targets that are drawn twice make ranks noisier, and noise moves tau towards 0.
+    # Targets that are drawn twice make ranks noisier, and noise moves tau towards 0. The interval
+    # is extended to the observed tau.
     low, high = min(low, observed), max(high, observed)
-    p = _compute_permutation_p_value(ranks[1] - ranks[0], rng)
-    return RankAgreement(
-        observed, float(low), float(high), _compute_mean_split_half_tau(ranks[0], rng), p
-    )
+    p_value = _compute_permutation_p_value(ranks[1] - ranks[0], rng)
+    halves = _compute_mean_split_half_tau(ranks[0], rng)
+    return RankAgreement(observed, float(low), float(high), halves, p_value)
 
 
 def _compute_permutation_p_value(changes: Array, rng: np.random.Generator) -> float:

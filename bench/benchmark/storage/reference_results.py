@@ -93,6 +93,8 @@ class ReferenceResult:
     def find_mismatches(self, experiment: Experiment) -> list[str]:
         """List the differences from an experiment that is drawn over it, one line each.
 
+        The reference is drawn in grey behind the results of the experiment.
+
         Raises:
             InputError: It is of another problem, so the errors are not comparable.
         """

@@ -190,6 +190,7 @@ def check_files(
     executed = statuses[statuses["status"] != "skipped"]
     if not is_unfinished:
         check_complete(executed, experiment, status.make_error)
+        # A tuner without runs is skipped, and then has a row that says so.
         labels = set(statuses["tuner"])
         missing_labels = [label for label in list_tuner_labels(experiment) if label not in labels]
         if missing_labels:
@@ -358,7 +359,7 @@ def check_rows_match_statuses(
     Args:
         runs: One line per run, as read from `file`.
         file: File of the rows.
-        statuses: How they ended; cells checked.
+        statuses: Rows of status.csv, whose cells have been checked one by one.
         make_error: Makes the error for a row of the statuses.
         source: Name of the file of statuses, for messages.
 
@@ -427,6 +428,7 @@ def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> N
     # The name of a target is its range and a number, as `wide-017`.
     ranges_of_targets = runs["target"].str.replace(r"-\d+$", "", regex=True)
     check_equal(runs["range"], ranges_of_targets, "range", "of its target", make_row_error)
+    # Columns such as `true_damping` have the true parameters of the run's target.
     for name in runs.columns:
         if name.startswith("true_"):
             first = runs.drop_duplicates("target").set_index("target")[name]

@@ -171,7 +171,7 @@ def read_statuses(folder: Path) -> dict[int, RunStatus]:
     Another process may append runs, or delete the journal, at the same time.
 
     Raises:
-        InputError: The journal is damaged.
+        InputError: The journal is damaged, or the folder has runs of an earlier version.
     """
     _refuse_earlier_files(folder / SEGMENTS_FOLDER)
     path = folder / SEGMENTS_FOLDER / JOURNAL_FILE
