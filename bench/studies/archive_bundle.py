@@ -378,7 +378,7 @@ def _find_folder_kind(folder: Path) -> str:
     if (folder / VERDICT_FILE).is_file() and (folder / EXTENDED_MODEL_FILE).is_file():
         return "explanation"
     for part in list_study_folders(folder):
-        read_configuration(part)
+        read_configuration(part)  # raises an error for any other folder
         if (part / SEGMENTS_FOLDER).exists():
             raise InputError(f"{part}: not finished; resume it first")
     return "comparison"

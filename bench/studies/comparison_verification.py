@@ -263,7 +263,8 @@ def _verify_losses(
         proposed = _convert_to_unit_cube(
             problem, proposal_rows[[f"proposal_{name}" for name in names]]
         )
-        losses = np.concatenate([fitting(point[None])[1] for point in proposed])
+        # One point at a time, because the observations of all would not fit in memory.
+        losses = np.concatenate([loss for _, loss in (fitting(point[None]) for point in proposed)])
         yield from _find_first_difference(
             proposal_rows, "loss", losses, _SIMULATION_TOLERANCE, _SIMULATION_TOLERANCE
         )
@@ -275,6 +276,7 @@ def _verify_losses(
         # A run that ended before its first result has no error.
         has_value = rows[column].notna().to_numpy()
         if observed_runs.scenarios and has_value.any():
+            # A new evaluator knows no point, and simulates all recommendations.
             rmse = ProposalEvaluator(problem, observed_runs).compute_rmse(
                 recommended[:0], recommended[has_value]
             )

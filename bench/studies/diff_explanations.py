@@ -77,12 +77,12 @@ def select_relevant_environment(environment: Mapping[str, Any]) -> dict[str, Any
 
 
 def describe_side(folder: Any, name: str, environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Describe one of the two compared results.
+    """Describe one of the two compared results for the JSON document.
 
     Args:
         folder: its folder.
-        name: its name.
-        environment: its environment.
+        name: name of the experiment, or title of the explanation.
+        environment: content of its environment.json.
     """
     return {
         "folder": folder,

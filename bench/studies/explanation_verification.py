@@ -167,6 +167,7 @@ def _find_differing_numbers(
     for cause in verdict.causes:
         coefficients: Mapping[str, Any] = extended.effects.get(cause.effect, {})
         for name, fitted_value in cause.coefficients.items():
+            # A missing number is NaN, which is close to no number.
             value = coefficients[name].value if name in coefficients else math.nan
             if not math.isclose(fitted_value.value, value, rel_tol=RELATIVE_TOLERANCE):
                 label = f"{cause.effect} {name}"

@@ -84,6 +84,9 @@ def list_study_folders(folder: Path) -> list[Path]:
 def report_jointly(folder: Path, print_line: PrintLine) -> None:
     """Write and print the joint results of the studies in a folder, if their kind has any.
 
+    Several misspecification studies (with a table [calibration]), and the problems of a suite, have
+    joint results.
+
     Args:
         folder: folder that was given to `begin_studies`.
         print_line: callback that prints one line.

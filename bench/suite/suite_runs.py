@@ -119,6 +119,7 @@ def list_comparison_folders(folder: Path) -> Iterator[tuple[Path, str]]:
     """
     for subfolder in sorted(path for path in folder.iterdir() if path.is_dir()):
         if (subfolder / CONFIGURATION_FILE).is_file():
+            # A misspecification study has a comparison for each of its two simulators.
             models = [label for label in MODEL_LABELS if (subfolder / label).is_dir()]
             if models:
                 yield from ((subfolder / m, "before" if m == PLAIN else "after") for m in models)
@@ -165,6 +166,7 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
     """
     stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
     experiment = stored.experiment
+    # With a condition, the comparison is in a subfolder of the problem.
     problem = folder.parent.name if condition else folder.name
     skipped = stored.statuses[stored.statuses["status"] == "skipped"]
     if stored.runs.empty:
@@ -275,6 +277,7 @@ def concatenate(parts: Sequence[SuiteRuns]) -> SuiteRuns:
             for part in parts
         ]
     )
+    # A tuner that is skipped in one part may have runs in another one; then it is left out below.
     skipped = pd.concat([part.skipped for part in parts]).drop_duplicates("tuner")
     runs = pd.concat([part.runs for part in parts], ignore_index=True)
     is_first = ~runs.duplicated(RUN_KEYS)
@@ -395,7 +398,14 @@ def _encode_errors(errors: Array) -> dict[str, Any]:
 
 
 def _decode_errors(table: Any) -> Array:
-    """Return the errors (R, K + 1) of a stored table; see `_encode_errors`."""
+    """Return the errors (R, K + 1) of R stored runs after 0..K simulations.
+
+    They are run-length encoded decimal numbers, see `_encode_errors`: each mantissa and exponent
+    holds for a length (number of simulations).
+
+    Args:
+        table: stored runs, with the columns `_ERRORS_COLUMNS`.
+    """
     lengths, mantissas, exponents = (
         table[name].combine_chunks().flatten().to_numpy() for name in _ERRORS_COLUMNS
     )

@@ -126,6 +126,7 @@ class SuiteTables:
             ]
             # Empty if all tuners of the cell are trained.
             errors = errors or [pd.Series(dtype=float)]
+            # All runs on a target have the same start; the minimum passes over failed ones (inf).
             start_errors[cell] = pd.concat(errors).groupby(level=0).min()
         return start_errors
 

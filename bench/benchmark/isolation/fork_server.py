@@ -123,6 +123,7 @@ def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: 
         layers: names of the isolation layers that are active already.
     """
     set_parent_death_signal()
+    # The fork server ignores this signal; with that, no exit code of a child could be waited for.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     folder, (control, *pipes) = request["folder"], descriptors
     layers = [

@@ -177,6 +177,7 @@ def make_mounts_read_only() -> None:
     Raises:
         OSError: the kernel is older than 5.12, or does not permit it.
     """
+    # Attributes to set and to clear, propagation, and user namespace (`struct mount_attr`).
     attributes = struct.pack("<QQQQ", _READ_ONLY, 0, 0, 0)
     size = ctypes.c_size_t(len(attributes))
     current_folder = ctypes.c_int(_AT_FDCWD)

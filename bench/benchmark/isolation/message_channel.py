@@ -342,7 +342,9 @@ def _read_array(
 
 
 def to_points(proposed: object, dim: int, label: str) -> Array:
-    """Convert proposals or recommendations to a new array (n, dim) of any numbers.
+    """Convert proposals or recommendations to a new array (n, dim).
+
+    Its numbers are not checked: they may be outside the unit cube, or not finite.
 
     Args:
         proposed: points from the tuner.

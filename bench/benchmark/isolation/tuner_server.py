@@ -93,6 +93,7 @@ def _report_written_files(channel: MessageChannel, folder: str, reported_paths: 
         if path not in reported_paths
     ]
     reported_paths.update(new)
+    # A note names at most three files.
     names = [os.path.relpath(path, folder) for path in sorted(new)[:3]]
     channel.send_document(b"N", {"count": len(new), "names": names})
 

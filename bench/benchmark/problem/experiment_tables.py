@@ -305,7 +305,8 @@ def find_named_effects(*settings: Mapping[str, Any]) -> set[str]:
     """Return all effect names in settings, also those that a plugin may define later.
 
     Args:
-        settings: Tables of an experiment's simulator, with `effects` and `fixed` effects by name.
+        settings: Settings of simulators: ``effects`` are names of effects whose coefficients are
+            tuned, ``fixed`` has fixed coefficients by name of the effect.
     """
     names: set[str] = set()
     for table in settings:
@@ -313,6 +314,6 @@ def find_named_effects(*settings: Mapping[str, Any]) -> set[str]:
             value = table.get(key, ())
             # Values of a wrong type are reported by the simulator.
             if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
-                # An effect at a place of a robot is the effect without the place.
+                # `viscous@elbow` is the effect `viscous` at one joint of a robot.
                 names.update(name.partition("@")[0] for name in value if isinstance(name, str))
     return names

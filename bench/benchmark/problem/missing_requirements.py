@@ -64,6 +64,7 @@ def leave_out_missing_problems(suite: Experiment) -> tuple[Experiment, dict[str,
         return suite, {}
     available_files, reasons = [], {}
     for file in suite.experiments:
+        # The file of a problem may sweep over values, and then stands for several problems.
         for problem in expand_sweep(suite.chosen(experiments=(file,))):
             missing = availability(problem)
             if missing.data_set:

@@ -263,6 +263,7 @@ class ClusterPool:
         transferable = [argument for argument in arguments if isinstance(argument, Transferable)]
         paths = [path for argument in transferable for path in argument.list_files()]
         contents = [self._send_file(path) for path in paths]
+        # `pure=False`: Dask must not return the result of an earlier, equal call.
         return self._client.submit(
             run_on_worker, function, arguments, seconds, self._plugins, paths, contents, pure=False
         )

@@ -122,17 +122,17 @@ class ExperimentRun:
         without a target.
         """
         experiment = self.problem.experiment
-        simulator = experiment.simulator
-        common_cells = {
+        common_cells: dict[str, Any] = {
+            "simulator": experiment.simulator,
             "target": "",
             "seed": 0,
             "status": "skipped",
             "simulations": 0,
             "seconds": 0.0,
+            "trusted": experiment.trusted,
         }
-        common_cells["trusted"] = experiment.trusted
         return [
-            {"run": label, "tuner": label, "simulator": simulator, **common_cells, "reason": reason}
+            {"run": label, "tuner": label, **common_cells, "reason": reason}
             for label, reason in self.skipped.items()
         ]
 

@@ -238,8 +238,7 @@ def _make_untrusted_code_error(label: str, file: object) -> InputError:
     return InputError(
         f"tuner {label}: the code of {file} runs in this process, which has the true "
         "parameters: a simulator or effect in it is used here, or it was imported directly; put "
-        "the "
-        "tuner into a separate file, or use --trust"
+        "the tuner into a separate file, or use --trust"
     )
 
 

@@ -170,8 +170,8 @@ class RunIds:
     def __init__(self, experiment: Experiment) -> None:
         """Hash what all runs of the experiment share: configuration, simulator and code.
 
-        Tuners and targets are hashed when they are first used. `_entries` and `_targets` cache
-        these hashes by label of the tuner and by name of the target.
+        Tuners and targets are hashed when they are first used. `_entry_digests` and
+        `_target_digests` cache these hashes by label of the tuner and by name of the target.
         """
         self._experiment = experiment
         self._common_digest = compute_digest(
@@ -182,8 +182,8 @@ class RunIds:
             hash_source_folders(),
             hash_package_versions(),
         )
-        self._entries: dict[str, str] = {}
-        self._targets: dict[str, str] = {}
+        self._entry_digests: dict[str, str] = {}
+        self._target_digests: dict[str, str] = {}
 
     def make_run_id(self, entry: TunerEntry, target: BlindedTarget, seed: int, budget: int) -> str:
         """Return the identifier of one run: ``TUNER/TARGET/SEED/HASH``.
@@ -198,23 +198,23 @@ class RunIds:
             budget: number of simulations.
         """
         # Hashes are cached, because a plan may have a million runs.
-        if entry.label not in self._entries:
+        if entry.label not in self._entry_digests:
             kind = tuners.get(entry.tuner)
             training_budget = self._experiment.training_budget if kind.learned else 0
             nuisance = [dict(self._experiment.nuisance)] if entry.randomised else []
-            self._entries[entry.label] = compute_digest(
+            self._entry_digests[entry.label] = compute_digest(
                 entry.tuner,
                 dict(entry.options),
                 training_budget,
                 hash_class_source(kind),
                 *nuisance,
             )
-        if target.name not in self._targets:
-            self._targets[target.name] = _hash_target(target)
+        if target.name not in self._target_digests:
+            self._target_digests[target.name] = _hash_target(target)
         digest = compute_digest(
             self._common_digest,
-            self._entries[entry.label],
-            self._targets[target.name],
+            self._entry_digests[entry.label],
+            self._target_digests[target.name],
             seed,
             budget,
         )

@@ -151,7 +151,18 @@ def execute_run(experiment: Experiment, request: RunRequest) -> RunOutcome:
 def _execute_once(
     experiment: Experiment, request: RunRequest, requests: RepeatedRequests
 ) -> RunOutcome:
-    """Execute a run that may be a repetition; see `execute_run`."""
+    """Execute a run once: let the tuner propose points, and compute the errors of its results.
+
+    Args:
+        experiment: configuration of the experiment.
+        request: tuner, target, seed and budget of the run.
+        requests: points that the tuner requested before its process was killed; a repetition must
+            request the same.
+
+    Raises:
+        HiddenSimulationError: more points were simulated than the tuner requested from the harness.
+        KilledExternallyError: the tuner's process was killed externally.
+    """
     requests.restart()
     problem = get_problem(experiment)
     target = request.target
@@ -236,14 +247,14 @@ def _run_isolated(
     """
     assert request.tuned is not None
     state = None if request.weights is None else read_weights(request.weights)
-    names = _list_stream_names(experiment, request)
+    stream_names = _list_stream_names(experiment, request)
     tuner_context = start_isolated_tuner(
         request.tuned, request.seed, experiment.isolation, request.hidden, experiment.memory, state
     )
     try:
         with tuner_context as tuner:
-            run = IsolatedRun(tuner, make_seed_words(*names), experiment.timeout)
-            trace = drive_tuner(run, task, evaluate, make_rng(*names), experiment.timeout)
+            run = IsolatedRun(tuner, make_seed_words(*stream_names), experiment.timeout)
+            trace = drive_tuner(run, task, evaluate, make_rng(*stream_names), experiment.timeout)
             written = tuner.child.written()
             if trace.status in FAILED_STATUSES:
                 tuner.child.end()

@@ -181,14 +181,15 @@ class _RunRecord:
 
     def make_trace(self, status: str, reason: str) -> RunTrace:
         """Return the trace of the ended run."""
+        # Empty arrays come first, because a run without simulations has no batches.
         return RunTrace(
-            status,
-            reason,
-            np.concatenate(self._proposals) if self._proposals else np.empty((0, self._dim)),
-            np.concatenate(self._losses) if self._losses else np.empty(0),
-            np.stack(self._recommended),
-            _distribute_batch_seconds(self._tuner_seconds),
-            _distribute_batch_seconds(self._simulator_seconds),
+            status=status,
+            reason=reason,
+            proposals=np.concatenate([np.empty((0, self._dim)), *self._proposals]),
+            losses=np.concatenate([np.empty(0), *self._losses]),
+            recommendations=np.stack(self._recommended),
+            tuner_seconds=_distribute_batch_seconds(self._tuner_seconds),
+            simulator_seconds=_distribute_batch_seconds(self._simulator_seconds),
         )
 
 

@@ -569,8 +569,9 @@ def _should_retry(call: _AssignedCall, error: BaseException | None) -> bool:
     is_repeated = isinstance(error, BrokenExecutor) or (
         code in _EXTERNAL_KILL_EXIT_CODES and call.deaths < MAX_RETRIES
     )
-    if is_repeated:
-        call.deaths += code is not None
+    # A pool that broke has no exit code, and does not count as a death.
+    if is_repeated and code is not None:
+        call.deaths += 1
     return is_repeated
 
 

@@ -128,7 +128,7 @@ class RunRowTable:
         first = np.zeros(len(names), dtype=np.int64)
         first[codes[::-1]] = np.arange(len(codes))[::-1]
         self.keys = (
-            runs[[k for k in RUN_KEY_COLUMNS if k in runs]].iloc[first].reset_index(drop=True)
+            runs[[c for c in RUN_KEY_COLUMNS if c in runs]].iloc[first].reset_index(drop=True)
         )
         self.used = np.zeros(len(names), dtype=np.int64)
         np.maximum.at(self.used, codes, self._k)

@@ -223,7 +223,9 @@ def find_cheapest_tuners(
         cost.compute_seconds_per_target(SIMULATION_COST_GRID, targets)
         for cost in successful_costs.values()
     ]
+    # Position in `names` of the fastest tuner at each duration of the grid.
     cheapest = np.argmin(seconds, axis=0)
+    # Positions in the grid from which on another tuner is the fastest.
     changes = np.flatnonzero(np.diff(cheapest)) + 1
     edges = [0, *changes.tolist(), len(SIMULATION_COST_GRID)]
     return [

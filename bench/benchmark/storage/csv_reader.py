@@ -65,7 +65,7 @@ class CsvTable:
         """
         self._path, self._remedy = path, remedy
         self._text = self._read_text()
-        self._header = next(self._iterate_records(), (1, []))[1]
+        _, self._header = next(self._iterate_records(), (1, []))
         declared = columns(self._header) if callable(columns) else columns
         try:
             present_columns = select_declared_columns(self._header, declared)
@@ -324,6 +324,7 @@ def _check_counts(run: pa.Array, k: NDArray[np.int64], is_run_start: Mask) -> No
     Raises:
         CellError: k has another value, so that a row is missing or added.
     """
+    # The value of the row before plus one; the first row, to which `roll` wraps around, is a start.
     expected = np.where(is_run_start, 0, np.roll(k, 1) + 1)
     is_wrong = k != expected
     if is_wrong.any():
