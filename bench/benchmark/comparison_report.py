@@ -94,13 +94,13 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
     files = {comparison_figures.FIGURE_FILES[name]: pictures[name] for name in pictures}
     figures = [path for path in write_figures(folder, files) if path.suffix == ".png"]
     results = ComparisonReportData(
-        view,
-        tables,
-        pictures,
-        read_environment(folder),
-        str(folder),
-        (folder / CONFIGURATION_FILE).read_text(encoding="utf-8"),
-        _count_missing_runs(folder, stored),
+        view=view,
+        tables=tables,
+        pictures=pictures,
+        environment=read_environment(folder),
+        folder=str(folder),
+        configuration=(folder / CONFIGURATION_FILE).read_text(encoding="utf-8"),
+        missing=_count_missing_runs(folder, stored),
     )
     write_atomically(folder / REPORT_FILE, render_page(results))
 

@@ -297,6 +297,7 @@ class Comparison(Study):
         from bench.benchmark.comparison_report import write_report
 
         failed = write_report(self.folder, print_line)
+        # Notes for the authors of tuners, if runs were made in this session.
         for line in self.results.notes.lines() if self.results else ():
             print_line(line)
         return failed

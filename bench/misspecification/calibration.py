@@ -53,6 +53,7 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
             experiment, streams.get_held_out_stream(run_index), initial, inputs
         )
         noise_free = problem.world.simulate(theta, scene)[0]
+        # Each run has its own stream of sensor noise.
         rng = TargetStreams(salt, experiment.name, "calibration", 1 + run_index).get_stream("noise")
         measured = noise_free + problem.noise * rng.standard_normal(noise_free.shape)
         channels = dict(zip(names, np.ascontiguousarray(measured.T), strict=True))

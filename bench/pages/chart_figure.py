@@ -292,6 +292,7 @@ def _draw_span(axis: Axes, span: AxisSpan) -> None:
         return
     axis.axvspan(span.low, span.high, ymin=0.0, ymax=_FOOT_SHARE, color=colour, linewidth=0)
     if np.log10(span.high / span.low) > _MIN_NAMED_DECADES:
+        # The geometric mean is the middle on a logarithmic axis.
         middle = (np.sqrt(span.low * span.high), _FOOT_SHARE + 0.01)
         position = ("data", "axes fraction")
         axis.annotate(span.says, middle, xycoords=position, ha="center", fontsize=7.5)
@@ -300,16 +301,15 @@ def _draw_span(axis: Axes, span: AxisSpan) -> None:
 def _draw_rules(axis: Axes, rules: Sequence[ReferenceLine], horizontal: bool) -> None:
     """Draw dashed lines with their texts, unless they are outside the panel.
 
-    In a horizontal figure, a text up the line would cross the rows: only its name is written.
-
     Args:
         axis: axes of the panel.
-        rules: the lines.
+        rules: the lines, each at a value of the x or of the y axis.
         horizontal: whether the axes of the panel are exchanged.
     """
     line: dict[str, Any] = {"color": CAPTION_GREY, "linewidth": 0.8, "linestyle": (0, (2, 2))}
     text: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7.5}
     for rule in rules:
+        # A line at a value of the x axis is vertical, unless the axes are exchanged.
         is_vertical = (rule.along == "x") != horizontal
         low, high = sorted(axis.get_xlim() if is_vertical else axis.get_ylim())
         if not low <= rule.value <= high:
@@ -320,6 +320,8 @@ def _draw_rules(axis: Axes, rules: Sequence[ReferenceLine], horizontal: bool) ->
                 "xy": (rule.value, 0),
                 "xycoords": ("data", "axes fraction"),
             }
+            # The text is written up the line. In a horizontal figure it would cross the rows, so
+            # that only its beginning up to the colon is written.
             says = rule.says.partition(":")[0] if horizontal else rule.says
             axis.annotate(says, xytext=(-9, 4), rotation=90, **position, **text)
         else:

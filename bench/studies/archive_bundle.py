@@ -479,10 +479,11 @@ def _format_explain_command(folder: Path) -> str:
         Command line for a shell.
     """
     environment = read_environment(folder)
+    # The descriptions of recordings (.toml) are listed too, but are not arguments of the command.
     tables = [
         recording["file"]
         for recording in environment.get("recordings", [])
-        if recording["file"][-5:] != ".toml"
+        if not recording["file"].endswith(".toml")
     ]
     words = format_explain_command(tables or ["RECORDING.csv"], environment.get("settings", {}))
     return shlex.join(words)
@@ -577,6 +578,7 @@ def _verify_archive(
     if description["kind"] == "explanation":
         explanation = _verify_explanation(unpacked.folder, archive, print_line)
         return Verification([], explanation, description)
+    # Results are named by their path in the archive, and not in the temporary folder.
     comparisons = [
         verify_comparison(part, print_line, plugins, every, own_plugins=False)._replace(
             folder=archive / part.relative_to(unpacked.folder.parent)

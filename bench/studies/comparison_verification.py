@@ -32,6 +32,8 @@ from sims.core.simulator import Array, InputError
 PrintLine = Callable[[str], None]
 MAX_RESIMULATED_ROWS = 2000
 """Maximum number of simulations that are repeated, unless all are requested."""
+_MAX_PRINTED_FAILURES = 20
+"""Maximum number of verification failures that are printed."""
 _ARITHMETIC_TOLERANCE = 1e-9
 """Relative tolerance of numbers that arithmetic alone determines."""
 _SIMULATION_TOLERANCE = 1e-6
@@ -145,17 +147,17 @@ def verify_comparison(
 def print_failures(
     doubts: Sequence[VerificationFailure], folder: Path, print_line: PrintLine
 ) -> None:
-    """Print the doubts (numbers that do not follow from others), at most 20 of them.
+    """Print verification failures, at most `_MAX_PRINTED_FAILURES` of them, and their number.
 
     Args:
-        doubts: verification failures.
+        doubts: files and rows that do not follow from others.
         folder: folder of the results.
         print_line: prints one line of text.
     """
-    for doubt in doubts[:20]:
+    for doubt in doubts[:_MAX_PRINTED_FAILURES]:
         print_line(f"NOT REPRODUCED  {folder}/{doubt}")
-    if len(doubts) > 20:
-        print_line(f"and {len(doubts) - 20} more")
+    if len(doubts) > _MAX_PRINTED_FAILURES:
+        print_line(f"and {len(doubts) - _MAX_PRINTED_FAILURES} more")
 
 
 def _describe_salt(experiment: Experiment) -> str:

@@ -89,7 +89,7 @@ def describe_tests(tables: SuiteTables) -> list[str]:
     tests = []
     rows = tables.pairs[tables.pairs["training"] == FREE]
     for simulations, part in rows.groupby("simulations"):
-        # The best tuner must also win on more than half of the problems.
+        # The test is two-sided, so the best tuner must also win on more than half of the problems.
         is_significant = (part["p_holm"] < _SIGNIFICANCE) & (part["best_better"] > 0.5)
         undecided = list(part["tuner"][~is_significant])
         best = part["best"].iloc[0]

@@ -185,9 +185,10 @@ class SuiteTables:
     ) -> pd.Series[float]:
         """Compute the logarithms of the errors of a tuner after k simulations, by target.
 
-        With training counted, a trained tuner has k less its share of the training simulations, and
-        no advance over the start before that. A regressor has its estimate of the parameters before
-        any simulation of the target, but not before its training.
+        If training is counted, the target's share of the training simulations is a part of the k
+        simulations: a trained tuner has only the others for the target. With fewer simulations than
+        that share it counts with the error of the start, although a regressor, for example, has an
+        estimate of the parameters before any simulation of the target.
 
         Args:
             means: mean errors over seeds, a row per target, a column per number of simulations.

@@ -109,7 +109,7 @@ def unshare(flags: int) -> None:
     """Move this process into new namespaces.
 
     Args:
-        flags: kinds of the namespaces.
+        flags: kinds of the namespaces, as bits such as `CLONE_NEWNET`.
 
     Raises:
         OSError: the kernel does not permit it.

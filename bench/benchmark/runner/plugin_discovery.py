@@ -81,7 +81,11 @@ class DiagnoserStub(Diagnoser):
 
 
 def _make_stub(description: dict[str, Any]) -> Any:
-    """Make the stub class of a tuner or diagnoser from its description by the isolated process."""
+    """Make the stub of a tuner or diagnoser: a class with its properties, but without its code.
+
+    Args:
+        description: properties of the class, as the isolated process has described them.
+    """
     base = TunerStub if description["kind"] == "tuner" else DiagnoserStub
     fields: dict[str, Any] = {
         "name": str(description["name"]),

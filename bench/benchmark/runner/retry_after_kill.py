@@ -47,20 +47,20 @@ class RepeatedRequests:
 
     def __init__(self) -> None:
         self._earlier: list[bytes] = []
-        self._place = 0
+        self._position = 0
 
     def restart(self) -> None:
         """Begin the work, or begin it again."""
-        self._place = 0
+        self._position = 0
 
     def check(self, request: bytes) -> None:
-        """Store a new request, or compare it with the one before the kill.
+        """Store a new request; in a repetition, compare it with the request at this position.
 
         Raises:
             RunEndedError: it differs from the one before the kill.
         """
-        if self._place == len(self._earlier):
+        if self._position == len(self._earlier):
             self._earlier.append(request)
-        elif self._earlier[self._place] != request:
+        elif self._earlier[self._position] != request:
             raise RunEndedError("crashed", NOT_REPRODUCIBLE_REASON)
-        self._place += 1
+        self._position += 1

@@ -116,8 +116,8 @@ def check_unchanged(folder: Path, initial: dict[str, str], present: dict[str, st
 
     Args:
         folder: folder of the study.
-        initial: fingerprint when the study was started.
-        present: present fingerprint.
+        initial: hashes by readable name when the study was started; empty if they are unknown.
+        present: present hashes, from `compute_fingerprint`.
 
     Raises:
         InputError: something has changed since the study was started.

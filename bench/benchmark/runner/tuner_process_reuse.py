@@ -119,6 +119,7 @@ def start_part_process(
         hidden: folders that the process must not access.
         modules: modules that the fork server loads first, in addition to those of the part.
     """
+    # The project's own code may be loaded in advance, that of a plugin never.
     is_builtin = not part.file and part.module.startswith(("bench.", "methods."))
     own_module = [part.module] if is_builtin else []
     return get_fork_server().start_process(

@@ -198,6 +198,11 @@ def _simulate_points(message: Message, simulator: TrainingSimulator) -> dict[str
 
     Returns:
         The observations, and the state of the random generator after drawing the scenario.
+
+    Raises:
+        ProtocolError: the message has no points of this dimension.
+        ValueError: the state is not that of a generator, or a point is outside the training range.
+        BudgetExceededError: more simulations are requested than the budget allows.
     """
     request = unpack_arrays(message.body)
     points = request.get("points", np.empty(0))
@@ -409,6 +414,7 @@ def _check_weights(request: TrainingRequest, path: Path) -> None:
         load_trained_tuner(request.entry, path)
         return
     try:
+        # The tuner restores the weights when it is started.
         with start_isolated_tuner(
             request.tuned, request.seed, "run", request.hidden, state=read_weights(path)
         ):

@@ -455,6 +455,7 @@ class _WorkerSlot:
     def stop(self) -> None:
         """End the process, including a running call."""
 
+        # The pool is bound here, because `_replace_process` may replace it while the thread runs.
         def end(pool: Any = self._pool) -> None:
             pool.stop()
             pool.join()

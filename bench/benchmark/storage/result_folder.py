@@ -215,7 +215,7 @@ def write_results(
         journal: Its finished runs.
         trainings: Tuner, seed, simulations and seconds of each training.
         skipped: Rows of status.csv for tuners that could not be used.
-        trusted: Whether the tuners ran inside the harness.
+        trusted: Whether the tuners ran without isolation.
     """
     import pandas as pd
     import pyarrow as pa
