@@ -154,7 +154,7 @@ class RangeResult:
     def warning(self) -> str:
         """Sentence on too few targets for any significant difference; empty otherwise.
 
-        With few targets even a tuner that wins on all of them may do so by chance.
+        With few targets even a tuner that wins on all of them may do so under the null hypothesis.
         """
         count, targets = self._comparison_count, self._deciding_count
         required_targets = compute_min_targets(count) if count else 0
