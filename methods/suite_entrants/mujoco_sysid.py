@@ -28,17 +28,13 @@ class MuJoCoSysId(Tuner):
 
         def minimise(residuals: Callable[[Array], Array]) -> str:
             """Minimise residuals (n, N) of points (n, dim); mujoco.sysid has points in columns."""
-            # MuJoCo would look for a display in another process.
-            os.environ.setdefault("MUJOCO_GL", "disable")
+            os.environ.setdefault("MUJOCO_GL", "disable")  # else MuJoCo looks for a display
             sysid = importlib.import_module("mujoco.sysid")  # it has no types
             cube = sysid.ParameterDict()
             cube.add(sysid.Parameter("cube", task.start, np.zeros(task.dim), np.ones(task.dim)))
-
-            def compute_residuals(x: Array, _: object) -> tuple[list[Array], None, None]:
-                # One group of residuals; the toolbox's predictions and data are not used.
-                return [residuals(x.reshape(task.dim, -1).T).T], None, None
-
-            sysid.optimize(cube, compute_residuals, verbose=False, output=io.StringIO())
+            # One group of residuals; the toolbox's predictions and data are not used.
+            compute_groups = lambda x, _: ([residuals(x.reshape(task.dim, -1).T).T], None, None)  # noqa: E731
+            sysid.optimize(cube, compute_groups, verbose=False, output=io.StringIO())
             return "mujoco.sysid reached its tolerance"
 
         return from_callback(minimise, task.compute_finite_residuals)
