@@ -86,12 +86,12 @@ class MisspecificationStudy(Study):
         """
         from bench.benchmark.runner.experiment_runner import no_progress
 
-        finished_count = planned_count = 0
         try:
             self._extend(jobs, progress or no_progress)
         except KeyboardInterrupt:
-            count = self._count_planned_runs()
-            return StudyOutcome(0, 2 * count, interrupted=True)
+            count_per_model = self._count_planned_runs()
+            return StudyOutcome(0, 2 * count_per_model, interrupted=True)
+        finished_count = planned_count = 0
         for model in MODEL_LABELS:
             comparison = self._open_comparison(model, jobs)
             outcome = comparison.run(jobs, progress, pool)
@@ -108,7 +108,7 @@ class MisspecificationStudy(Study):
                     outcome.skipped,
                 )
         self.reveal_salt()
-        # The folder of segments contained only the salt.
+        # The folder of segments contained only the salt, which is public now.
         segments = self.folder / SEGMENTS_FOLDER
         if segments.is_dir() and not any(segments.iterdir()):
             segments.rmdir()

@@ -95,10 +95,10 @@ def make_method_series(
             y,
             look,
             {column: name, **(where or {})},
-            shift=compute_category_offset(place, len(styles)) if is_shifted else 0.0,
+            shift=compute_category_offset(index, len(styles)) if is_shifted else 0.0,
             **options,
         )
-        for place, (name, look) in enumerate(styles.items())
+        for index, (name, look) in enumerate(styles.items())
     )
 
 

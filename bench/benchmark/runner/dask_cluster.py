@@ -145,7 +145,9 @@ class ClusterPool:
             if not any(isinstance(answer, OSError) for answer in worker_answers.values()):
                 break
         answers = {
-            w: answer for w, answer in worker_answers.items() if not isinstance(answer, OSError)
+            worker: answer
+            for worker, answer in worker_answers.items()
+            if not isinstance(answer, OSError)
         }
         for answer in answers.values():
             if isinstance(answer, BaseException):

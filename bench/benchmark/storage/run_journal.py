@@ -132,7 +132,8 @@ def parse_statuses(path: Path, heads: Sequence[bytes]) -> dict[int, RunStatus]:
 
     Args:
         path: path of the journal, for messages.
-        heads: JSON texts ``[index, {column: value}]``; the index is the place in the plan.
+        heads: JSON texts ``[index, {column: value}]``; the index is the position in the
+            plan of runs.
 
     Returns:
         Statuses by index in the plan.
