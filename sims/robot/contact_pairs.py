@@ -39,7 +39,9 @@ class ContactParameters(NamedTuple):
 
 
 def get_geom_name(model: Any, geom: int) -> str:
-    """Return the name of a geom; such as ``geom3`` if it has none.
+    """Return the name of a geom in the model file; such as ``geom3`` if it has none there.
+
+    The prefix of names that `add_contact_pairs` gave to unnamed geoms is removed.
 
     Args:
         model: compiled model.
@@ -92,8 +94,9 @@ def find_geom(robot: RobotModel, name: str) -> int:
 def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactParameters:
     """Return the parameters that MuJoCo gives to a contact of two geoms.
 
-    The geom with the higher priority determines them; with equal priorities, spring, damper and
-    impedance are averaged with the weights `solmix` of the geoms, and the larger friction counts.
+    The geom with the higher priority determines them. With equal priorities, spring and damper
+    (`solref`) and impedance (`solimp`) are averaged with the weights `solmix` of the geoms, and the
+    larger friction counts. Margins and gaps are added in both cases.
 
     Args:
         model: compiled model.
@@ -102,9 +105,10 @@ def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactPar
     geom_rows = np.array(geoms)
     margin, gap = float(model.geom_margin[geom_rows].sum()), float(model.geom_gap[geom_rows].sum())
     priority = model.geom_priority[geom_rows]
+    # One geom remains, or both if their priorities are equal.
     geom_rows = geom_rows[priority == priority.max()]
     mixes = np.where(model.geom_solmix[geom_rows] < MIN_MIX, 0.0, model.geom_solmix[geom_rows])
-    if not mixes.any():
+    if not mixes.any():  # Neither geom has a weight, so both count equally.
         mixes = np.ones(len(geom_rows))
     weights = mixes / mixes.sum()
     solref = model.geom_solref[geom_rows]
@@ -114,6 +118,7 @@ def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactPar
     sliding, torsional, rolling = model.geom_friction[geom_rows].max(axis=0)
     return ContactParameters(
         int(model.geom_condim[geom_rows].max()),
+        # A pair has two coefficients for the two tangents, and two for the rolling axes.
         np.array([sliding, sliding, torsional, rolling, rolling]),
         solref.min(axis=0) if has_direct_form else weights @ solref,
         weights @ model.geom_solimp[geom_rows],
@@ -124,17 +129,17 @@ def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactPar
 
 @cache_per_robot
 def find_pair(robot: RobotModel, pair: str) -> int:
-    """Return the number of the element `<pair>` of two geoms.
+    """Return the number of the element `<pair>` of two geoms in the compiled model.
 
     Args:
-        robot: robot of `add_contact_pairs`.
-        pair: name of the pair.
+        robot: robot with this element, such as a result of `add_contact_pairs`.
+        pair: names of both geoms, joined by `PAIR_SEPARATOR`.
     """
     model, geoms = robot.compiled, set(find_pair_geoms(robot, pair))
     return next(
-        i
-        for i in range(model.npair)
-        if {int(model.pair_geom1[i]), int(model.pair_geom2[i])} == geoms
+        number
+        for number in range(model.npair)
+        if {int(model.pair_geom1[number]), int(model.pair_geom2[number])} == geoms
     )
 
 
@@ -151,7 +156,9 @@ def has_pair(robot: RobotModel, geoms: Collection[int]) -> bool:
 
 
 def read_contact_parameters(robot: RobotModel, pair: str) -> tuple[float, Array]:
-    """Return the sliding friction coefficient and `solref` of a pair in the model file.
+    """Return the sliding friction coefficient and `solref` of a contact of two geoms.
+
+    They are those of its element `<pair>`, or the combined ones of both geoms without an element.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -183,7 +190,8 @@ def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
         return robot
     spec = robot.spec.copy()
     if not all(geom.name for geom in spec.geoms):
-        # Elements have numbers only after compilation.
+        # Elements have numbers only after compilation, and lose them when one is edited, so the
+        # numbers are listed before.
         with capture_mujoco_warnings():
             spec.compile()
         for geom, number in [(geom, geom.id) for geom in spec.geoms]:

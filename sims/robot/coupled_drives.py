@@ -35,9 +35,11 @@ def find_preceding_joint(robot: RobotModel, name: str) -> Joint | None:
         name: joint.
 
     Returns:
-        The preceding joint; None if there is none or if it is of another kind.
+        The nearest joint towards the base; None if there is none, or if one is a hinge and the
+        other a slide.
     """
     model, second_joint = robot.compiled, robot.joint(name)
+    # First the joints of the same body before this one, then all joints of each ancestor.
     body = int(model.jnt_bodyid[second_joint.id])
     first_joint_id, end_joint_id = int(model.body_jntadr[body]), second_joint.id
     while body > 0:
@@ -55,10 +57,8 @@ def find_preceding_joint(robot: RobotModel, name: str) -> Joint | None:
 def list_coupling_places(robot: RobotModel) -> tuple[str, ...]:
     """List the joints whose drives can be coupled to the preceding joint.
 
-    The preceding joint is the next joint towards the base; a joint without one cannot be coupled.
-
-    Args:
-        robot: Robot with its joints and actuators.
+    Such a joint is a hinge or slide with an actuator. The preceding joint is the next one towards
+    the base; it must be of the same kind.
     """
     driven_joints = {actuator.joint for actuator in robot.actuators}
     return tuple(
@@ -71,10 +71,10 @@ def list_coupling_places(robot: RobotModel) -> tuple[str, ...]:
 
 
 def make_coupled_robot(robot: RobotModel, coefficients: Mapping[str, float]) -> RobotModel:
-    """Make a robot with tendons in place of joint transmissions, without changing element names.
+    """Make a robot whose coupled drives act on tendons in place of joints; names do not change.
 
-    The tendon has the length l = q + c p, with the position q of the drive's joint and p of the
-    preceding one; its force acts on both, U and c U (1).
+    A tendon has the length l = q + c p, with the position q of the drive's joint and p of the
+    preceding one. So the actuator force U acts on both joints, as U and c U (1).
 
     Args:
         robot: robot as read from its model file.

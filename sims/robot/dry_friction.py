@@ -42,14 +42,18 @@ The negative value makes MuJoCo read the second number as a damping.
 def get_friction_solref(timestep: float, integrator: int) -> tuple[float, float]:
     """Return `solref` of stiff dry friction, which stops a velocity within one step.
 
-    Friction acts with a time constant 1 / b. A step of Euler or of the implicit integrators stops
-    the velocity completely with b = 1 / h, and overshoots beyond it. The four evaluations of RK4
-    tolerate `MAX_RK4_FRICTION_RATE` / h, and 3 / h chatters. MuJoCo's default time constant,
-    0.02 s, creeps at rest.
+    Friction pulls the velocity v to zero by the reference acceleration -b v. A step of Euler or of
+    the implicit integrators stops the velocity completely with b = 1 / h, and overshoots beyond it.
+    The four evaluations of RK4 tolerate b = `MAX_RK4_FRICTION_RATE` / h, and 3 / h chatters. With
+    MuJoCo's default time constant of 0.02 s, a joint at rest creeps.
 
     Args:
         timestep: time step h in seconds.
         integrator: MuJoCo's number of the integrator.
+
+    Returns:
+        For RK4 the negative stiffness and the damping -b, a form that MuJoCo takes as it is.
+        Otherwise a time constant of 2 h and a damping ratio of 1, for which MuJoCo sets b = 1 / h.
     """
     if integrator == RK4_INTEGRATOR_ID:
         return (SOLREF_PLACEHOLDER_STIFFNESS, -MAX_RK4_FRICTION_RATE / timestep)
@@ -57,19 +61,22 @@ def get_friction_solref(timestep: float, integrator: int) -> tuple[float, float]
 
 
 def write_friction_form(fields: Fields, robot: RobotModel, batch_indices: Any, dofs: Any) -> None:
-    """Set the solver parameters of dry friction that effects add, in the form of the robot.
+    """Make the dry friction of some joints as stiff as the time step allows, by solver parameters.
 
-    Time step and integrator are taken from the fields if they contain them, else from the file.
+    Nothing is changed if the robot's `friction_form` is ``soft``: then the friction that effects
+    add keeps the solver parameters of the file. Time step and integrator are taken from the fields
+    if they contain them, else from the file.
 
     Args:
         fields: model fields of the batch elements, changed in place.
-        robot: its `friction_form` decides; ``soft`` keeps the parameters of the file.
-        batch_indices: index of the batch elements.
-        dofs: index of the joints' velocities.
+        robot: robot with the friction form.
+        batch_indices: NumPy index (numbers, slice or mask) of the batch elements.
+        dofs: NumPy index of the joints' velocities.
     """
     if robot.friction_form == "soft":
         return
     option = robot.compiled.opt
+    # All batch elements have the same options, so the first one stands for them.
     timestep = fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep
     integrator = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
     solref = get_friction_solref(float(timestep), int(integrator))
@@ -78,10 +85,12 @@ def write_friction_form(fields: Fields, robot: RobotModel, batch_indices: Any, d
 
 
 def get_friction_constraint(robot: RobotModel, dof: int) -> tuple[float, float]:
-    """Return damping b (1/s) and impedance d of MuJoCo's constraint for friction loss.
+    """Return damping b (1/s) and impedance d of MuJoCo's constraint for dry friction.
 
     The constraint has the reference acceleration -b v at the velocity v. The values are those of
-    the form in which effects add friction to the robot.
+    the robot's `friction_form`, in which effects add friction. With `solref` (timeconst, dampratio)
+    and the largest impedance d_max of `solimp`, MuJoCo sets b = 2 / (d_max timeconst). Negative
+    numbers (-stiffness, -damping) give b = damping / d_max.
 
     Args:
         robot: robot with the time step and the integrator in use.
@@ -94,13 +103,14 @@ def get_friction_constraint(robot: RobotModel, dof: int) -> tuple[float, float]:
     if robot.friction_form == "stiff":
         solref = get_friction_solref(float(model.opt.timestep), int(model.opt.integrator))
         solimp = FRICTION_SOLIMP
-    timeconst, ratio = (float(value) for value in solref)
+    timeconst, second = (float(value) for value in solref)
     limits = np.clip(solimp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     (at_rest, largest), width = limits.tolist(), float(solimp[2])
     # Friction has no constraint violation. For a constant impedance, MuJoCo takes the mean.
     d = at_rest if width > mujoco.mjMINVAL else 0.5 * (at_rest + largest)
     if timeconst <= 0:
-        return -ratio / largest, d
+        return -second / largest, d
+    # By default, MuJoCo uses no smaller time constant than two time steps.
     if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE):
         timeconst = max(timeconst, 2.0 * float(model.opt.timestep))
     return 2.0 / (largest * timeconst), d

@@ -36,13 +36,14 @@ GRAVITY_COMPENSATED = "gravity is compensated: the real robot or its controller 
 
 
 def is_gravity_compensated(effect: str, numbers: Mapping[str, FittedValue]) -> bool:
-    """Return whether a correction of gravity removes gravity completely.
+    """Return whether a cause is a correction of gravity that removes gravity almost completely.
 
     The real robot, or its controller, then carries its own weight.
 
     Args:
-        effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-        numbers: fitted numbers by coefficient.
+        effect: name of the effect, such as ``gravity.scale``.
+        numbers: fitted numbers by coefficient. That of ``gravity.scale`` is the relative change
+            of gravity, so that -1 removes it.
     """
     return effect == "gravity.scale" and any(
         abs(1.0 + number.value) < MAX_COMPENSATED_GRAVITY_SHARE for number in numbers.values()
@@ -80,7 +81,8 @@ class FittedCause:
     def format(self, recording: str) -> str:
         """Format as ``friction.coulomb@elbow: 0.3 N·m (95 %: 0.28 to 0.32), fitted to log.csv``.
 
-        A cause that is an option of the solver is formatted as "from ... to ...".
+        An option of the solver whose values are words, such as the integrator, is formatted as
+        ``numerics.integrator: from Euler to RK4``.
 
         Args:
             recording: Name of the recording for the text; empty to leave it out.
@@ -90,6 +92,7 @@ class FittedCause:
         if self.effect in OPTION_EFFECTS:
             (estimate,) = self.numbers.values()
             option = OPTION_EFFECTS[self.effect]
+            # The value of such an estimate is the option's number itself, not a change of it.
             before, after = (
                 format_option(option, value if value is not None else estimate.value)
                 for value in (estimate.stated, estimate.total)
@@ -106,7 +109,8 @@ class FittedCause:
 def _format_estimate(number: FittedValue) -> str:
     """Format as ``-0.05 N·m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N·m``.
 
-    The last part is the number in the model file before and after.
+    The parts are the fitted change, its confidence interval if it is known, and the number in the
+    model file before and after the change if the file has one.
     """
     text = append_unit(f"{number.value:.4g}", number.unit)
     if number.low is not None and number.high is not None:
@@ -145,8 +149,11 @@ def _list_family_causes(
 ) -> list[FittedCause]:
     """Return the causes of an effect family, one for each place.
 
-    A number with the key ``coefficient@place`` belongs to that place; a number without a place
-    belongs to all of them.
+    Args:
+        robot: robot with the places.
+        effect: name of the effect without a place.
+        numbers: fitted numbers. One with the key ``coefficient@place`` belongs to that place, one
+            with the key ``coefficient`` to all places.
     """
     by_place: dict[str, dict[str, FittedValue]] = {}
     for key, number in numbers.items():
@@ -159,6 +166,9 @@ def _list_family_causes(
 
 def _list_places(robot: RobotModel, effect: str) -> list[str]:
     """List the places of an effect family that has one number for all places.
+
+    These are the actuators for an effect on inputs, and the joints for all others. Sensor effects
+    are not divided, since no model file states them; their place is `ALL_PLACES`.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.

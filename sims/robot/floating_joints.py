@@ -60,12 +60,11 @@ class FloatingJoints:
 
     @classmethod
     def from_robot(cls, robot: RobotModel) -> FloatingJoints:
-        """Return the floating joints of a robot.
+        """Return the floating joints of a robot, with their addresses in `qpos` and `qvel`.
 
-        These are free joints (three translations and a quaternion) and ball joints (a quaternion).
-
-        Returns:
-            The joints with their columns in `qpos` and `qvel`.
+        A free joint has a position and a quaternion in `qpos` (7 numbers), and a velocity and an
+        angular velocity in `qvel` (6). A ball joint has only the quaternion (4) and the angular
+        velocity (3).
         """
         joints = tuple(joint for joint in robot.joints if not joint.has_one_coordinate)
         positions = [
@@ -86,7 +85,10 @@ class FloatingJoints:
         return bool(self.joints)
 
     def names(self) -> tuple[list[str], list[str]]:
-        """Return the names of positions and velocities, such as ``q.base.qw``, ``qd.base.wx``."""
+        """Return the names of the pose entries (P), and those of the velocities (F).
+
+        Examples are ``q.base.qw`` and ``qd.base.wx``.
+        """
         names = list(self.units())
         return (
             [name for name in names if name.startswith("q.")],
@@ -115,7 +117,10 @@ class FloatingJoints:
         return dict(zip(positions, poses, strict=True)) | dict.fromkeys(velocities, 0.0)
 
     def get_initial_state(self, states: Mapping[str, float]) -> FloatingState:
-        """Return the initial state of a run, (P,) and (F,), from known states by name.
+        """Return the initial pose (P,) and velocity (F,) of a run, with normalised quaternions.
+
+        Args:
+            states: initial states by name, as in `names`.
 
         Raises:
             InputError: a quaternion is zero.
@@ -132,34 +137,31 @@ class FloatingJoints:
                 raise InputError(
                     f"initial states {state_names}: expected a quaternion, found zeros"
                 )
+            # This is a view, so that the quaternion in the pose is normalised.
             quaternion /= length
         return FloatingState(pose, rate)
 
-    def displace(self, pose: Array, number: int, displacement: float) -> Array:
-        """Displace poses along one degree of freedom, by eq. (1): add to a position, or rotate.
-
-        The pose becomes position + d_p and q exp(d_r / 2) (1), with the orientation q as a
-        quaternion.
+    def displace_coordinate(self, pose: Array, number: int, displacement: float) -> Array:
+        """Displace poses along one degree of freedom: add to a position, or rotate about an axis.
 
         Args:
             pose: (n, P) poses.
-            number: index of the degree of freedom, below F.
-            displacement: displacement in m or rad.
+            number: index of the degree of freedom among the F velocities.
+            displacement: displacement in m or rad; see `displace`.
 
         Returns:
             The displaced poses (n, P).
         """
         displacements = np.zeros((len(pose), self.velocities.size))
         displacements[:, number] = displacement
-        return self.displaced(pose, displacements)
+        return self.displace(pose, displacements)
 
-    def displaced(self, pose: Array, displacements: Array) -> Array:
-        """Displace poses (n, P) by small displacements (n, F) by eq. (1), in m and rad.
+    def displace(self, pose: Array, displacements: Array) -> Array:
+        """Displace poses (n, P) by small displacements (n, F) in m and rad.
 
-        Positions move along the axes of the world; rotations are about the axes of the body.
-
-        The pose becomes position + d_p and q exp(d_r / 2) (1), with the orientation q as a
-        quaternion.
+        The position p of a body becomes p + d_p, along the axes of the world. Its orientation, the
+        quaternion q, becomes q exp(d_r / 2) with the rotation vector d_r in the axes of the body
+        (1). Moving for one second with the velocities (d_p, d_r) has this result in MuJoCo.
         """
         import mujoco
 
@@ -173,10 +175,10 @@ class FloatingJoints:
         return displaced_poses
 
     def compute_displacement(self, pose: Array, reference: Array) -> Array:
-        """Compute the displacements (n, F) from reference poses (n, P) to poses (n, P).
+        """Compute the displacements (n, F) from reference poses (n, P) to other poses (n, P).
 
-        A displacement has the difference of positions, and the rotation vector of q_reference^-1 q.
-        F and P are the numbers of velocities and of pose numbers of all floating joints.
+        A displacement has the difference of positions in m, and the rotation vector of
+        q_reference^-1 q in rad, so that `displace` moves the reference pose to the other one.
         """
         import mujoco
 

@@ -26,13 +26,13 @@ def compute_point_inertias(arms: Array) -> Array:
 
 
 def compute_inertia_tensors(quaternions: Array, moments: Array) -> Array:
-    """Compute inertia tensors (L, 3, 3) in the axes of the bodies.
+    """Compute inertia tensors R diag(I) R' (L, 3, 3) in the axes of the bodies.
 
     Shapes: L batch elements.
 
     Args:
         quaternions: (L, 4) orientations of the principal axes, unit quaternions, w first.
-        moments: (L, 3) principal moments.
+        moments: (L, 3) principal moments I.
     """
     import mujoco
 
@@ -55,7 +55,7 @@ def compute_principal_axes(tensors: Array) -> tuple[Array, Array]:
     import mujoco
 
     moments, axes = np.linalg.eigh(tensors)
-    # A rotation has no reflection.
+    # The eigenvectors may be a reflection; with the first one reversed, they are a rotation.
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     quaternions = np.empty((len(axes), 4))
     for quaternion, matrix in zip(quaternions, axes, strict=True):
@@ -90,10 +90,10 @@ def compute_triangle_violation(moments: Array) -> float:
 def find_nearest_valid_moments(moments: Array) -> Array:
     """Return the nearest physically valid moments of inertia, in kg m^2.
 
-    Moments that are not positive become `MIN_MOMENT`. Principal moments A <= B <= C of a rigid body
-    also satisfy A + B >= C. If A + B is smaller, the violation C - A - B is divided equally: the
-    largest moment is decreased and both others are increased by a third of it, with a margin for
-    rounding.
+    Moments below `NEGLIGIBLE_MOMENT` become `MIN_MOMENT`. Principal moments A <= B <= C of a rigid
+    body also satisfy A + B >= C. If A + B is smaller, the violation C - A - B is divided equally:
+    the largest moment is decreased and both others are increased by a third of it, with a margin
+    for rounding.
 
     Args:
         moments: (3,) principal moments in kg m^2.
@@ -103,7 +103,7 @@ def find_nearest_valid_moments(moments: Array) -> Array:
     )
     margin = ROUNDING_SHARE * np.max(raised_moments)
     correction = (compute_triangle_violation(raised_moments) + margin) / 3
-    if correction <= margin / 3:  # without a violation
+    if correction <= margin / 3:  # The triangle inequality is satisfied.
         return raised_moments
     return np.where(
         raised_moments == np.max(raised_moments),

@@ -76,10 +76,11 @@ class IntegratorSettings(NamedTuple):
             options: numbers by name of the option, as in `to_model_options`.
         """
         changed = {**self.to_model_options(), **options}
-        words = {number: word for word, number in INTEGRATOR_IDS.items()}
+        integrator_names = {number: name for name, number in INTEGRATOR_IDS.items()}
         return IntegratorSettings(
             changed.pop("timestep"),
-            words[int(changed.pop("integrator"))],
+            integrator_names[int(changed.pop("integrator"))],
+            # All options that remain are those of the solver.
             tuple(sorted(changed.items())),
         )
 
@@ -119,12 +120,11 @@ def list_changed_options(
         Number in the file and number in use, by the effect that names the option.
     """
     options = settings.to_model_options()
-    changes = {
-        effect: (read_option(robot, name), options[name])
+    return {
+        effect: (file_number, options[name])
         for effect, name in OPTION_EFFECTS.items()
-        if name in options
+        if name in options and (file_number := read_option(robot, name)) != options[name]
     }
-    return {effect: pair for effect, pair in changes.items() if pair[0] != pair[1]}
 
 
 DEFAULT_SETTINGS = IntegratorSettings(0.002, "Euler")
@@ -156,10 +156,10 @@ def read_integrator_settings(robot: RobotModel) -> IntegratorSettings:
 
 
 def specifies_integrator(robot: RobotModel) -> bool:
-    """Return whether the robot's model file specifies how it is simulated.
+    """Return whether the robot's model file specifies the time step and the integrator.
 
-    An MJCF does, by its defaults too. A URDF describes the robot alone, unless it contains options
-    of MuJoCo.
+    An MJCF always does, since values that it omits are MuJoCo's defaults. A URDF describes the
+    robot alone, unless it contains options of MuJoCo other than the defaults.
     """
     return robot.format == "mjcf" or read_integrator_settings(robot) != DEFAULT_SETTINGS
 
@@ -179,6 +179,8 @@ MIN_TIME_STEP, MAX_TIME_STEP = 1e-9, 1.0
 
 def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> list[str]:
     """Apply the table ``[engine]`` of a recording to a model: its time step, integrator and base.
+
+    The entry ``recorded_bases`` is only checked here; `separate_floating_joints` applies it.
 
     Args:
         spec: a mujoco.MjSpec; it is changed in place.

@@ -37,8 +37,9 @@ def close_loops(
 ) -> dict[str, float]:
     """Place unmeasured joints of closed loops where the constraints put them, by eq. (1).
 
-    Unmeasured joints u satisfy the constraints r(q) = 0 by steps q_u <- q_u - J_u^+ r(q); their
-    velocities are v_u = -J_u^+ J_m v_m, with the measured joints m and J = dr/dq (1).
+    The constraints of the loops are r(q) = 0, with J = dr/dq and its pseudo-inverse J^+. Positions
+    of unmeasured joints u satisfy them by steps q_u <- q_u - J_u^+ r(q); their velocities are
+    v_u = -J_u^+ J_m v_m, with the measured joints m (1).
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -51,6 +52,7 @@ def close_loops(
     """
     import mujoco
 
+    # 1. Model and initial state.
     joints = [joint for joint in robot.joints if f"q.{joint.name}" in states]
     if not unmeasured or not robot.compiled.neq:
         return dict(states)
@@ -60,6 +62,8 @@ def close_loops(
     data = mujoco.MjData(model)
     for joint in joints:
         data.qvel[joint.velocity] = states[f"qd.{joint.name}"]
+    # 2. Positions: the measured joints move in small steps from the reference pose to their states,
+    # and the unmeasured ones follow.
     placed = [joint for joint in joints if joint.name in unmeasured]
     positions = [joint.position for joint in placed]
     velocities = np.array([joint.velocity for joint in placed])
@@ -73,6 +77,7 @@ def close_loops(
         jacobian = _solve_constraints(model, data, positions, velocities)
         if jacobian is None:
             return dict(states)
+    # 3. Velocities: v_u = -J_u^+ J_m v_m.
     assert jacobian is not None
     fixed_rates = data.qvel.copy()
     fixed_rates[velocities] = 0.0
@@ -103,6 +108,7 @@ def _solve_constraints(
     import mujoco
 
     for _ in range(MAX_STEPS):
+        # MuJoCo stores J and r of all constraints; equality constraints are the first `ne` rows.
         mujoco.mj_fwdPosition(model, data)
         jacobian: Array = data.efc_J.reshape(-1, model.nv)[: data.ne].copy()
         step = -np.linalg.pinv(jacobian[:, velocities]) @ data.efc_pos[: data.ne]
@@ -115,9 +121,12 @@ def _solve_constraints(
 def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
     """Return the groups of joints that constraints of a MuJoCo model couple.
 
-    Their motions are not independent, so effects at them may be indistinguishable. A `connect` or
-    `weld` constraint couples the joints between its two bodies and their common ancestor. A joint
-    equality couples its two joints.
+    Their motions are not independent, so effects at them may be indistinguishable:
+
+    * A `connect` or `weld` constraint couples the joints between its two bodies and their nearest
+      common ancestor.
+    * A joint equality couples its two joints.
+    * Constraints of other kinds are ignored.
 
     Args:
         model: compiled MuJoCo model (`mujoco.MjModel`).
@@ -137,6 +146,7 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
         first_object = int(model.eq_obj1id[constraint])
         second_object = int(model.eq_obj2id[constraint])
         if kind == int(constraint_types.mjEQ_JOINT):
+            # The second joint is -1 if the first one is held at a constant.
             coupled_dofs = [
                 int(model.jnt_dofadr[joint])
                 for joint in (first_object, second_object)
@@ -147,6 +157,7 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
                 first_object, second_object = (
                     int(model.site_bodyid[site]) for site in (first_object, second_object)
                 )
+            # Ancestors of one of the bodies only are those below the common ancestor.
             first_ancestors = _list_ancestors(model, first_object)
             second_ancestors = _list_ancestors(model, second_object)
             coupled_dofs = [
@@ -156,6 +167,7 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
             ]
         else:
             continue
+        # Merge the group with all former ones that share a joint with it.
         group = {joint_of_dof[dof] for dof in coupled_dofs if dof in joint_of_dof}
         overlapping_groups = [other_group for other_group in groups if other_group & group]
         groups = [other_group for other_group in groups if not other_group & group]

@@ -114,39 +114,42 @@ def compute_factor(c: Any) -> Any:
 
 
 def gain_pulls(robot: RobotModel, number: int, term: int) -> bool:
-    """Return whether an actuator's control is a set point of position (1) or velocity (2).
+    """Return whether an actuator's control is a set point of its position or its velocity.
+
+    The actuator's force is gain * control + b_0 + b_1 * position + b_2 * velocity. The control is
+    a set point of the quantity whose bias parameter b is the negative gain.
 
     Args:
         robot: robot with the actuator.
         number: number of the actuator.
-        term: index in `biasprm`: 1 for the position, 2 for the velocity.
+        term: index of the quantity in `biasprm`: 1 for the position, 2 for the velocity.
     """
     import mujoco
 
     model = robot.compiled
     gain, bias = model.actuator_gainprm[number], model.actuator_biasprm[number]
     fixed = int(model.actuator_gaintype[number]) == int(mujoco.mjtGain.mjGAIN_FIXED)
-    # With a position gain as well, the set point is multiplied by the position gain.
+    # With a position gain as well, the set point is that of the position.
     return bool(fixed and gain[0] == -bias[term] and (term == 1 or bias[1] == 0))
 
 
 def _make_finder(name: str, *index: int) -> Find:
-    """Return a finder of an element at a joint or a body, as the name of its field tells.
+    """Return a function that finds one number of a joint or a body in a field of the model.
 
-    Fields called ``dof_`` have a row for each velocity, ``qpos`` for each position, ``jnt_`` for
-    each joint, and ``body_`` for each body.
+    The beginning of the field's name tells what its rows are: ``dof_`` velocities, ``qpos0``
+    positions, ``jnt_`` joints, and ``body_`` bodies.
 
     Args:
-        name: name of the field.
-        index: index within the row.
+        name: name of the field, such as ``dof_damping``.
+        index: index of the number within the row; the whole row if empty.
     """
 
     def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
         if name.startswith("body_"):
             return [[ModelField(name, (robot.body(place).id, *index))]]
         joint = robot.joint(place)
-        rows = {"dof": joint.velocity, "jnt": joint.id, "qpo": joint.position}
-        return [[ModelField(name, (rows[name[:3]], *index))]]
+        rows = {"dof": joint.velocity, "jnt": joint.id, "qpos0": joint.position}
+        return [[ModelField(name, (rows[name.partition("_")[0]], *index))]]
 
     return find
 
@@ -163,22 +166,18 @@ def _find_mass_centre_fields(robot: RobotModel, place: str) -> list[list[ModelFi
 
 
 def _make_servo_gain_finder(term: int) -> Find:
-    """Return a finder of the fields that hold a gain of a servo.
+    """Return a function that finds the model fields with the stiffness or the damping of a servo.
 
-    `term` is the index in the actuator's bias: 1 for the stiffness, 2 for the damping. The bias
-    holds the negative gain. MuJoCo's gain field holds the same number where the control
-    multiplies it.
+    A servo's force is gain * control + b_0 + b_1 * position + b_2 * velocity, so b_1 is the
+    negative stiffness, and b_2 the negative damping. If the control is a set point of the position
+    or the velocity, the gain is the stiffness or the damping, too.
+
+    Args:
+        term: 1 for the stiffness, 2 for the damping.
     """
 
     def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
-        """Return the bias field with the servo's gain, and the gain field if it is the same.
-
-        `term` is the index of the bias parameter: 1 for position, 2 for velocity.
-
-        Args:
-            robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-            place: name of the actuator.
-        """
+        """Return the fields with the same gain of the actuator `place`: gain (if any), and bias."""
         actuator_id = robot.actuator(place).id
         servo_fields = [ModelField("actuator_biasprm", (actuator_id, term), -1)]
         if gain_pulls(robot, actuator_id, term):
@@ -196,10 +195,9 @@ def _find_force_range_fields(robot: RobotModel, place: str) -> list[list[ModelFi
         place: name of the actuator.
     """
     actuator_id = robot.actuator(place).id
-    range_fields = [
-        ModelField("actuator_forcerange", (actuator_id, end), (-1, 1)[end]) for end in (1, 0)
-    ]
-    return [range_fields]
+    upper_end = ModelField("actuator_forcerange", (actuator_id, 1))
+    lower_end = ModelField("actuator_forcerange", (actuator_id, 0), sign=-1)
+    return [[upper_end, lower_end]]
 
 
 def _view_element(fields: Fields, element: ModelField) -> Any:
@@ -208,9 +206,10 @@ def _view_element(fields: Fields, element: ModelField) -> Any:
 
 
 def _add(find: Find) -> FieldWriter:
-    """Make a function that adds each coefficient to its number by eq. (1).
+    """Make a function that adds each coefficient c to its number in the model, at least zero (1).
 
-    The new value is value + c, at least zero (1).
+    Args:
+        find: finds the element of each coefficient; only the main one of each is changed.
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -222,14 +221,19 @@ def _add(find: Find) -> FieldWriter:
 
 
 def _scale(find: Find) -> FieldWriter:
-    """Make a function that scales all fields of a number by 1 + c, eq. (2).
+    """Make a function that scales a number of the model by 1 + c, in all elements that hold it (2).
 
     The factor is at least `MIN_FACTOR`, so that masses stay positive.
+
+    Args:
+        find: finds the elements; the effect has one coefficient.
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-        for element in find(robot, place)[0]:
+        (elements,) = find(robot, place)
+        for element in elements:
             view = _view_element(fields, element)
+            # An element may be a vector, such as principal moments, which is scaled as a whole.
             view *= compute_factor(c[0]).reshape(-1, *[1] * (view.ndim - 1))
 
     return write
@@ -246,27 +250,23 @@ def _shift(find: Find) -> FieldWriter:
 
 
 def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the dry friction of a joint by eq. (1), in N m or N.
+    """Add c to the dry friction of a joint, at least zero (1).
 
     Where the friction increases, it also becomes stiff, so that the joint hardly creeps at rest;
-    with `friction_form` soft, the file's solver parameters remain.
-
-    Shapes: L batch elements.
-
-    The new value is value + c, at least zero (1).
+    if the robot's `friction_form` is ``soft``, the file's solver parameters remain.
 
     Args:
-        fields: model fields of the batch elements, changed in place.
-        robot: robot as read from its model file.
+        fields: model fields of L batch elements, changed in place.
+        robot: robot with the joint.
         place: name of the joint.
-        c: (K, L) coefficients of the effect.
+        c: (1, L) coefficient in N m or N.
     """
-    column = robot.joint(place).velocity
+    dof = robot.joint(place).velocity
     loss = fields["dof_frictionloss"]
     # A reduced friction keeps the solver parameters of the file.
     has_added_friction = c[0] > 0
-    loss[:, column] = add_to_file_value(loss[:, column], c[0])
-    write_friction_form(fields, robot, has_added_friction, column)
+    loss[:, dof] = add_to_file_value(loss[:, dof], c[0])
+    write_friction_form(fields, robot, has_added_friction, dof)
 
 
 def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -284,7 +284,7 @@ def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None
 
 
 def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
-    """Scale the file's gravity by 1 + c, in addition to any tilt of gravity.
+    """Scale the file's gravity by 1 + c; a tilt that another effect has added is not scaled.
 
     Args:
         fields: fields of L batch elements, changed in place.
@@ -293,7 +293,6 @@ def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> N
         c: (1, L) coefficient.
     """
     gravity = fields["opt.gravity"]
-    # The tilt that another effect added is not scaled.
     gravity += c[0][:, None] * robot.compiled.opt.gravity
 
 
@@ -326,31 +325,25 @@ def _set_coupling(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
 
 def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Turn the axis of a joint by the rotation vector c in rad, eq. (6), where c is not zero.
+    """Turn the axis of a joint by a rotation vector in the frame of its body, where it is not zero.
 
-    `vector` (n, 3) holds the rotation vectors of these n elements. The rotation follows
-    Rodrigues' formula; the result is normalised because MuJoCo expects a unit vector.
-
-    Shapes: L batch elements.
-
-    The axis a becomes exp([r]) a with the rotation vector r in rad, in the frame of the body (6).
+    The axis a becomes exp([r]) a with the rotation vector r (6), by Rodrigues' formula. The result
+    is normalised, because MuJoCo expects a unit vector.
 
     Args:
-        fields: model fields of the batch elements, changed in place.
-        robot: robot as read from its model file.
+        fields: model fields of L batch elements, changed in place.
+        robot: robot with the joint.
         place: name of the joint.
-        c: (K, L) coefficients of the effect.
+        c: (K, L) components of r in rad: all three, or only those that change the motion.
     """
     joint_id = robot.joint(place).id
     tilted_elements = np.flatnonzero(c.any(axis=0))
     axis = fields["jnt_axis"][tilted_elements, joint_id]
-    vector = np.zeros(axis.shape)
-    # At a place, the effect has only the coefficients that the motion shows.
-    vector[:, list(range(3) if len(c) == 3 else observable_tilts(robot, place))] = c[
-        :, tilted_elements
-    ].T
-    angle = np.linalg.norm(vector, axis=1, keepdims=True)
-    unit_vector = vector / angle
+    rotation_vector = np.zeros(axis.shape)
+    components = range(3) if len(c) == 3 else observable_tilts(robot, place)
+    rotation_vector[:, list(components)] = c[:, tilted_elements].T
+    angle = np.linalg.norm(rotation_vector, axis=1, keepdims=True)
+    unit_vector = rotation_vector / angle
     along = np.sum(unit_vector * axis, axis=1, keepdims=True)
     rotated = (
         np.cos(angle) * axis
@@ -379,70 +372,68 @@ def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array)
 
 
 def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add a point mass to a body by eq. (7), in the batch elements whose payload is not zero.
+    """Add a point mass to a body, in the batch elements whose payload is not zero.
 
-    The coefficients are the mass in kg and its offset from the file's centre of mass in m, in
-    the body frame. MuJoCo stores principal moments and their axes, so the tensor is composed in
-    the body frame, changed, and decomposed again into eigenvalues and eigenvectors.
+    A point mass m at p on a body of mass m_0, centre of mass p_0 and tensor I_0 gives (7)
 
-    Shapes: L batch elements.
+        mass     m_0 + m
+        centre   p_1 = (m_0 p_0 + m p) / (m_0 + m)
+        tensor   I_0 + m_0 J(p_0 - p_1) + m J(p - p_1),  J(d) = |d|^2 1 - d d'
 
-    A point mass m at p on a body of mass m_0, centre of mass p_0 and tensor I_0 gives the mass m_0
-    + m, the centre p_1 = (m_0 p_0 + m p) / (m_0 + m) and the tensor I_0 + m_0 J(p_0 - p_1) + m J(p
-    - p_1), with J(d) = |d|^2 1 - d d' (7).
+    MuJoCo stores principal moments and their axes, so the tensor is composed in the body frame,
+    changed, and decomposed again into eigenvalues and eigenvectors.
 
     Args:
-        fields: model fields of the batch elements, changed in place.
-        robot: robot as read from its model file.
+        fields: model fields of L batch elements, changed in place.
+        robot: robot with the body.
         place: name of the body.
-        c: (K, L) coefficients of the effect.
+        c: (4, L) mass in kg, and its offset x, y, z in m from the file's centre of mass, in the
+            body frame.
     """
     body_id = robot.body(place).id
     loaded = np.flatnonzero(c[0])
     point = robot.compiled.body_ipos[body_id] + c[1:, loaded].T
     mass, centre = fields["body_mass"][loaded, body_id], fields["body_ipos"][loaded, body_id]
     total = mass + c[0, loaded]
-    middle = (mass[:, None] * centre + c[0, loaded, None] * point) / total[:, None]
+    new_centre = (mass[:, None] * centre + c[0, loaded, None] * point) / total[:, None]
     tensor = compute_inertia_tensors(
         fields["body_iquat"][loaded, body_id], fields["body_inertia"][loaded, body_id]
     )
-    tensor += mass[:, None, None] * compute_point_inertias(centre - middle)
-    tensor += c[0, loaded, None, None] * compute_point_inertias(point - middle)  # (7)
+    tensor += mass[:, None, None] * compute_point_inertias(centre - new_centre)
+    tensor += c[0, loaded, None, None] * compute_point_inertias(point - new_centre)  # (7)
     moments, axes = compute_principal_axes(tensor)
     fields["body_mass"][loaded, body_id] = total
-    fields["body_ipos"][loaded, body_id] = middle
+    fields["body_ipos"][loaded, body_id] = new_centre
     fields["body_inertia"][loaded, body_id] = moments
     fields["body_iquat"][loaded, body_id] = axes
 
 
 def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Restrict the force range of an actuator to [-c, c], eq. (5), in batch elements with c > 0.
+    """Restrict the force range of an actuator to [-c, c], in batch elements with c > 0 (5).
 
-    `free` marks elements whose actuator has no force range yet; theirs starts from ±infinity.
-
-    Shapes: L batch elements.
+    The result is the intersection with the range of the file. If this is empty, both ends are the
+    end of the file's range that is nearer to [-c, c].
 
     Args:
-        fields: model fields of the batch elements, changed in place.
-        robot: robot as read from its model file.
+        fields: model fields of L batch elements, changed in place.
+        robot: robot with the actuator.
         place: name of the actuator.
-        c: (K, L) coefficients of the effect.
+        c: (1, L) limit of the force in N or N m.
     """
     actuator_id = robot.actuator(place).id
     is_limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
-    limits = c[0] > 0
-    free = limits & ~is_limited[:, actuator_id].astype(bool)
-    ranges[free, actuator_id] = (-np.inf, np.inf)
-    force_range = np.stack([-c[0], c[0]], axis=1)[limits]
-    low, high = ranges[limits, actuator_id].T
-    ranges[limits, actuator_id] = np.clip(force_range, low[:, None], high[:, None])  # (5)
-    is_limited[limits, actuator_id] = True
+    has_limit = c[0] > 0
+    # The file states no range for these elements.
+    is_unlimited = has_limit & ~is_limited[:, actuator_id].astype(bool)
+    ranges[is_unlimited, actuator_id] = (-np.inf, np.inf)
+    force_range = np.stack([-c[0], c[0]], axis=1)[has_limit]
+    low, high = ranges[has_limit, actuator_id].T
+    ranges[has_limit, actuator_id] = np.clip(force_range, low[:, None], high[:, None])  # (5)
+    is_limited[has_limit, actuator_id] = True
 
 
 def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the sliding friction coefficients of a pair of geoms by (1).
-
-    The new value is value + c, at least zero (1).
+    """Add c to both sliding friction coefficients of a pair of geoms, at least zero (1).
 
     Args:
         fields: fields of L batch elements, changed in place.
@@ -455,10 +446,11 @@ def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Arra
 
 
 def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the radius of a geom by (8), without changing mass and inertia of its body.
+    """Scale the radius of a geom by 1 + c, without changing mass and inertia of its body (8).
 
-    Radii and half axes change by the factor 1 + c, and the volumes that bound the geom by the
-    change d of its largest size (8).
+    The radius of a sphere, capsule or cylinder is scaled, or all half axes of an ellipsoid. If the
+    geom grows, the volumes by which MuJoCo searches for contacts grow by the change of its largest
+    size; they may be too large, so they do not shrink with it.
 
     Args:
         fields: fields of L batch elements, changed in place.
@@ -475,16 +467,21 @@ def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
     size *= compute_factor(c[0])[:, None]
     fields["geom_rbound"][:, geom] += growth
     fields["geom_aabb"][:, geom, 3:] += growth[:, None]
+    # Volumes of the geom's body in the bounding volume hierarchy; columns are centre and half axes.
     first = int(model.body_bvhadr[model.geom_bodyid[geom]])
     volumes = slice(first, first + int(model.body_bvhnum[model.geom_bodyid[geom]]))
     fields["bvh_aabb"][:, volumes, 3:] += growth[:, None, None]
 
 
 def _scale_solref(index: int) -> FieldWriter:
-    """Make a function that scales the time constant (0) or damping ratio (1) of a contact, (9).
+    """Make a function that scales the time constant t or the damping ratio z of a contact by 1 + c.
 
-    `solref` (t, z) becomes (t (1 + c), z) or (t, z (1 + c)); in the direct form (-k, -b), k is
-    proportional to 1 / (t z)^2 and b to 1 / t (9).
+    MuJoCo's `solref` is (t, z), or in the direct form the negative stiffness and damping (-k, -b).
+    There, k is proportional to 1 / (t z)^2 and b to 1 / t, so a change of t changes both, and a
+    change of z only k (9).
+
+    Args:
+        index: 0 for the time constant, 1 for the damping ratio.
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -512,7 +509,15 @@ def _make_effect(
     changes_derived_constants: bool = False,
     operation: Operation = "abs",
 ) -> ModelFieldEffect:
-    """Make an effect whose coefficients change the elements of a finder, all in the same way."""
+    """Make an effect whose coefficients all change their elements in the same way.
+
+    Args:
+        make_writer: makes the function that changes the elements: `_add`, `_scale` or `_shift`.
+        find: finds the elements of each coefficient.
+        *fields: names of the fields with these elements.
+        changes_derived_constants: as in `ModelFieldEffect`.
+        operation: as in `ModelFieldEffect`.
+    """
     return ModelFieldEffect(fields, make_writer(find), changes_derived_constants, find, operation)
 
 
@@ -596,10 +601,11 @@ Each acts at a place of its kind, and those of the world at any place, such as `
 
 
 def get_write_order(effect: str) -> int:
-    """Return the sort key of an effect in the order in which model fields are written.
+    """Return the sort key of an effect in the order in which model fields are written: 0 or 1.
 
-    A payload comes last, since errors of a body's own mass and inertia do not apply to it. In a
-    URDF, a joint's zero is a turn about the axis, so it comes after errors of the axis.
+    Two effects come last. A payload does, since errors of a body's own mass and inertia do not
+    apply to it. In a URDF, a joint's zero is a turn about the axis, so it follows errors of the
+    axis.
     """
     return int(effect in ("joint.zero", "payload"))
 
@@ -616,8 +622,8 @@ def model_fields(robot: RobotModel, effect: str, place: str) -> list[list[ModelF
         For each coefficient, the elements that hold its number, the main one first; empty if the
         model has no such number.
     """
-    found = MODEL_FIELD_EFFECTS.get(effect)
-    return found.find(robot, place) if found and found.find else []
+    field_effect = MODEL_FIELD_EFFECTS.get(effect)
+    return field_effect.find(robot, place) if field_effect and field_effect.find else []
 
 
 def operation_of(effect: str) -> Operation:

@@ -88,14 +88,17 @@ def strip_assets(robot: RobotModel) -> RobotModel:
 def _strip_model(robot: RobotModel) -> RobotModel:
     """Remove the elements of a robot's model that do not influence its motion, if it stays equal.
 
-    Visual shapes and geoms that cannot collide are deleted; a colliding mesh is replaced by its
-    convex hull. The hull's data are copied from the whole model, for which the spec gets extra
-    meshes that reserve memory. If any field of the smaller model that matters, or any contact in
-    random poses, differs from the whole model, the robot itself is returned.
+    1. State the masses of bodies, delete visual shapes and geoms that cannot collide, and replace
+       colliding meshes by their convex hulls.
+    2. Let compiled models copy the data of the hulls from the whole model. The spec gets extra
+       meshes that reserve memory for them.
+    3. Compare the smaller model with the whole one: fields that matter, and contacts in random
+       poses. If anything differs, return the robot itself.
 
     Raises:
         ValueError: MuJoCo rejects the smaller model.
     """
+    # 1. Smaller model.
     model = robot.compiled
     spec = robot.spec.copy()
     with capture_mujoco_warnings():
@@ -104,10 +107,11 @@ def _strip_model(robot: RobotModel) -> RobotModel:
     hull_by_mesh, geom_numbers = _reduce_geoms(spec, model)
     spec.discard_visual()
     spec.compiler.discardvisual = False
-    used_fields = {geom.hfieldname for geom in spec.geoms}
-    unused_fields = [field for field in spec.hfields if field.name not in used_fields]
-    for asset in [*spec.skins, *unused_fields]:
+    used_height_fields = {geom.hfieldname for geom in spec.geoms}
+    unused_height_fields = [h for h in spec.hfields if h.name not in used_height_fields]
+    for asset in [*spec.skins, *unused_height_fields]:
         spec.delete(asset)
+    # 2. Data of hulls.
     stripped = replace(robot, spec=spec)
     if hull_by_mesh:
         add_memory_reserve(spec, stripped.compile(spec), model, hull_by_mesh)
@@ -117,6 +121,7 @@ def _strip_model(robot: RobotModel) -> RobotModel:
             if geom.meshname in hull_by_mesh
         }
         stripped = replace(stripped, shapes=CollisionShapes.read(model, hull_by_mesh, hull_geoms))
+    # 3. Comparison.
     is_equal = _has_equal_motion(model, stripped.compiled, geom_numbers)
     if is_equal and hull_by_mesh:
         is_equal = has_large_enough_buffers(stripped.compiled, model)
@@ -135,17 +140,20 @@ def _strip_model(robot: RobotModel) -> RobotModel:
 
 @cache_per_robot
 def strip_shapes(robot: RobotModel) -> RobotModel:
-    """Remove all geoms that no other element refers to.
+    """Remove all geoms that no other element refers to, so that nothing collides any more.
 
-    The resulting model compiles in a millisecond, or fails to compile like the whole model.
+    The result tells whether elements that are added to it compile. Compiling it takes a
+    millisecond, and fails for the same reasons as compiling the whole model.
 
     Args:
         robot: robot as read from its model file.
 
     Returns:
-        The robot without contacts; the robot itself if MuJoCo cannot compile it without shapes.
+        The robot without contacts; the robot itself if MuJoCo cannot compile it without shapes, or
+        if it then has other coordinates.
     """
     spec = strip_assets(robot).spec.copy()
+    # Geoms that cannot collide count as visual.
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     try:
@@ -157,9 +165,10 @@ def strip_shapes(robot: RobotModel) -> RobotModel:
 
 
 def _needs_shapes(model: Any) -> bool:
-    """Return whether non-contact quantities depend on geoms, or contacts on more than hulls.
+    """Return whether anything depends on geoms other than contacts of convex hulls.
 
-    Meshes may be replaced by their convex hulls only if nothing else depends on the shapes.
+    Only otherwise may meshes be replaced by their hulls, and geoms that cannot collide be removed.
+    Examples are rangefinders, signed distance fields, fluid forces and sleeping bodies.
 
     Args:
         model: Compiled model of MuJoCo.
@@ -206,15 +215,20 @@ def _write_inertials(spec: Any, model: Any) -> None:
 def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int]]:
     """Make geoms that cannot collide visual, and reduce the meshes of the others to convex hulls.
 
-    A hull with few faces replaces a mesh only in the tested version of MuJoCo, because contacts
-    depend on the order of its vertices.
+    A geom with a mesh is one of these cases:
+
+    * The compiler has fitted a primitive, such as a box, to the mesh: the geom becomes it.
+    * It collides with a large mesh: the mesh becomes its convex hull. Only in the tested version
+      of MuJoCo, because contacts depend on the order of the hull's vertices.
+    * Otherwise it stays as it is.
 
     Args:
         spec: the model as an `MjSpec`, changed in place.
         model: the model, compiled from it.
 
     Returns:
-        The hulls by the names of their meshes, and the numbers of all geoms by their names.
+        The hulls by the names of their meshes, and the numbers of all geoms in the compiled model
+        by their names; unnamed ones get a name.
     """
     import mujoco
 
@@ -228,10 +242,9 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
         geom_numbers[geom.name] = geom_id
         if not collision_mask[geom_id]:
             geom.contype = geom.conaffinity = 0
-        mesh = int(model.geom_dataid[geom_id]) if geom.meshname else -1
-        if mesh < 0 and not geom.meshname:
+        if not geom.meshname:
             continue
-        # The compiler may have fitted a primitive to the mesh, or moved its frame.
+        mesh = int(model.geom_dataid[geom_id])
         kind = mujoco.mjtGeom(int(model.geom_type[geom_id]))
         if kind != mujoco.mjtGeom.mjGEOM_MESH:
             geom.type, geom.size, geom.meshname = kind, model.geom_size[geom_id], ""
@@ -242,6 +255,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
             hull_by_mesh[geom.meshname] = hull
         else:
             continue
+        # The compiler may have moved the frame of the mesh, so the compiled pose is stated.
         geom.set_frame(geom.parent.add_frame())
         geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
         geom.pos, geom.quat = model.geom_pos[geom_id], model.geom_quat[geom_id]
@@ -255,13 +269,15 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
 def _has_equal_motion(model: Any, reduced_model: Any, numbers: Mapping[str, int]) -> bool:
     """Return whether two models of one robot have equal fields, except for non-colliding shapes.
 
-    Equal fields guarantee an equal motion, without a simulation.
+    Equal fields guarantee an equal motion, without a simulation. Fields of integers are mostly
+    addresses, which may differ, so only fields of floating-point numbers are compared.
 
     Args:
         model: whole model.
         reduced_model: model with some of its geoms.
         numbers: numbers of the whole model's geoms, by geom name.
     """
+    # Geoms have other numbers in the reduced model, so those of the whole model are reordered.
     geom_numbers = [numbers[reduced_model.geom(i).name] for i in range(reduced_model.ngeom)]
     fields = {
         name: getattr(model, name)

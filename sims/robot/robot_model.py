@@ -230,11 +230,14 @@ class RobotModel:
 
     @cached_property
     def base_orientations(self) -> Mapping[str, tuple[float, ...]]:
-        """Orientation (w, x, y, z) in the file of each body with a recorded pose, by its joint."""
-        bodies = {base: self.joint(f"{base}.{ANGLES[0]}").id for base in self.recorded_bases}
+        """Orientation (w, x, y, z) in the file of each body with a recorded pose, by its joint.
+
+        The joint is the floating one of the file, which slides and hinges of the body replace.
+        """
+        hinges = {base: self.joint(f"{base}.{ANGLES[0]}").id for base in self.recorded_bases}
         return {
-            base: tuple(self.compiled.body(int(self.compiled.jnt_bodyid[joint])).quat.tolist())
-            for base, joint in bodies.items()
+            base: tuple(self.compiled.body(int(self.compiled.jnt_bodyid[hinge])).quat.tolist())
+            for base, hinge in hinges.items()
         }
 
     @cached_property
@@ -282,39 +285,37 @@ class RobotModel:
         )
 
     def _describe_actuator(self, i: int) -> Actuator:
-        """Describe actuator number i: its joint, kind of motion, control range and force range.
-
-        An actuator on the tendon that couples a joint to others counts as driving that
-        joint. Otherwise an actuator on a tendon has no joint, but a list of joints that it
-        moves. `motion` is hinge or slide, which gives the unit of the force; None if the
-        tendon moves joints of both kinds.
-        """
+        """Describe actuator number i of the compiled model: what it drives, and its limits."""
         import mujoco
 
         model = self.compiled
+        transmission, target = int(model.actuator_trntype[i]), int(model.actuator_trnid[i, 0])
+        # The joint that it drives. The tendon of a coupled drive stands for the drive's own joint.
         joint = None
-        drives = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-        if int(model.actuator_trntype[i]) in drives:
-            joint = self.joints[int(model.actuator_trnid[i, 0])].name
-        if self.coupled and int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON):
-            tendon = model.tendon(int(model.actuator_trnid[i, 0])).name
-            coupled_joint = tendon.removesuffix(COUPLING_TENDON_SUFFIX)
+        if transmission in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
+            joint = self.joints[target].name
+        if self.coupled and transmission == int(mujoco.mjtTrn.mjTRN_TENDON):
+            coupled_joint = model.tendon(target).name.removesuffix(COUPLING_TENDON_SUFFIX)
             joint = coupled_joint if coupled_joint in self.coupled else None
+        # Its controls. Before MuJoCo 4 each actuator had one control.
         control, controls = i, 1
         if hasattr(model, "actuator_ctrladr"):
             control, controls = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])
         is_limited = controls > 0 and bool(model.actuator_ctrllimited[control])
+        # Whether it acts along an angle or a length; neither if its tendon moves joints of both
+        # kinds.
         moved_joints = self._get_tendon_joints(i)
         motion = None
         if joint is not None:
             motion = self.joint(joint).motion
-        elif int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON):
+        elif transmission == int(mujoco.mjtTrn.mjTRN_TENDON):
             kinds = {self.joint(name).motion for name in moved_joints}
             if not kinds:
                 motion = "slide"  # a spatial tendon has a length, and no joints of its own
             elif len(kinds) == 1:
                 motion = kinds.pop()
-        elif int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_SITE):
+        elif transmission == int(mujoco.mjtTrn.mjTRN_SITE):
+            # The gear of a site has three components of a force, then three of a torque.
             motion = "slide" if model.actuator_gear[i, :3].any() else "hinge"
         return Actuator(
             name=model.actuator(i).name,
@@ -330,10 +331,9 @@ class RobotModel:
         )
 
     def _get_tendon_joints(self, i: int) -> tuple[str, ...]:
-        """Return the joints of the fixed tendon that an actuator drives, if it drives one.
+        """Return the names of the joints of the fixed tendon that actuator number i drives.
 
-        Args:
-            i: Index of the actuator.
+        There are none if it drives something else, or a spatial tendon.
         """
         import mujoco
 
@@ -343,15 +343,18 @@ class RobotModel:
         tendon = int(model.actuator_trnid[i, 0])
         first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
         wrap_indices = range(first, first + count)
-        is_joint = int(mujoco.mjtWrap.mjWRAP_JOINT)
+        joint_type = int(mujoco.mjtWrap.mjWRAP_JOINT)
         joints = [
-            int(model.wrap_objid[k]) for k in wrap_indices if int(model.wrap_type[k]) == is_joint
+            int(model.wrap_objid[k]) for k in wrap_indices if int(model.wrap_type[k]) == joint_type
         ]
         return tuple(self.joints[joint].name for joint in joints)
 
     @cached_property
     def bodies(self) -> tuple[Body, ...]:
-        """Bodies that joints move, directly or through other bodies."""
+        """Bodies that joints move, directly or through other bodies.
+
+        Their aliases are the links that are fused into them.
+        """
         model = self.compiled
         fused_names: dict[str, list[str]] = {}
         for alias, name in (self.aliases or {}).items():
@@ -361,20 +364,21 @@ class RobotModel:
             # Bodies welded to the world do not move; those welded to other bodies move with them.
             if int(model.body_weldid[body_id]) == 0:
                 continue
-            name = model.body(body_id).name
-            aliases = tuple(fused_names.get(name, ()))
-            moving_bodies.append(Body(name, body_id, float(model.body_mass[body_id]), aliases))
+            name, mass = model.body(body_id).name, float(model.body_mass[body_id])
+            moving_bodies.append(Body(name, body_id, mass, tuple(fused_names.get(name, ()))))
         return tuple(moving_bodies)
 
     @cached_property
     def sensors(self) -> tuple[SensorRow, ...]:
-        """Rows of all sensors."""
+        """Rows of all sensors; those of a sensor with several numbers end in their axis or number.
+
+        Examples are ``force.x``, ``pose.w`` of a quaternion, and ``user.0``.
+        """
         model = self.compiled
         rows = []
         for sensor_id in range(model.nsensor):
             name = model.sensor(sensor_id).name
             begin, count = int(model.sensor_adr[sensor_id]), int(model.sensor_dim[sensor_id])
-            # Axes, quaternion entries, or numbers.
             suffixes = {3: "xyz", 4: "wxyz"}.get(count) or map(str, range(count))
             name_endings = [""] if count == 1 else [f".{suffix}" for suffix in suffixes]
             unit = self._get_sensor_unit(sensor_id)
@@ -382,7 +386,7 @@ class RobotModel:
         return tuple(rows)
 
     def _get_sensor_unit(self, sensor: int) -> str:
-        """Return the SI unit of a sensor by its number; 1 if MuJoCo does not determine it."""
+        """Return the SI unit of a sensor by its number; ``1`` if the type does not determine it."""
         import mujoco
 
         model, sensor_types = self.compiled, mujoco.mjtSensor
@@ -445,9 +449,10 @@ class RobotModel:
 def cache_per_robot(
     function: Callable[Concatenate[RobotModel, _P], _T],
 ) -> Callable[Concatenate[RobotModel, _P], _T]:
-    """Cache the results of a function of a robot in the robot itself, by arguments.
+    """Cache the results of a function of a robot in the robot itself, by arguments (a decorator).
 
-    A cache of the module would hold every model that a process has read.
+    The results are freed with the robot. A cache of the module would hold every model that a
+    process has read.
     """
 
     @wraps(function)
@@ -474,6 +479,9 @@ def _get_limit(values: Any, is_limited: bool) -> tuple[float, float] | None:
 
 def _detect_actuator_kind(model: Any, i: int) -> ActuatorKind:
     """Return the kind of an actuator from its gain and bias (MuJoCo's shortcuts).
+
+    The force of an actuator with a constant gain g and an affine bias is
+    g * control + b_0 + b_1 * position + b_2 * velocity.
 
     Args:
         model: compiled model.

@@ -60,12 +60,14 @@ class RobotReference:
             folder: folder of the TOML file; None stores the model file's name without a folder.
         """
         model_path = self.path.name if folder is None else _make_relative_path(folder, self.path)
+        # Empty entries are left out.
         document = {
             key: value for key, value in asdict(self).items() if value and key in ROBOT_KEYS
         }
         # A file without the key means stiff friction, as files of earlier versions do.
         if self.friction_form == "stiff":
             del document["friction_form"]
+        # TOML has lists, and no tuples.
         free = {"free": list(self.free)} if self.free else {}
         return {"model": model_path, **document, **free}
 
@@ -98,7 +100,11 @@ class RobotReference:
 def make_robot_reference(kind: type[RobotSimulator]) -> RobotReference:
     """Make the reference with which an extended simulator finds and checks its robot again.
 
-    Numerical settings are stated only where they differ from the model file.
+    Numerical settings (time step, integrator, options of the solver) are stated only if any of them
+    differs from the model file.
+
+    Args:
+        kind: simulator class of the robot.
     """
     from sims.robot.integrator_settings import read_integrator_settings
 
@@ -116,8 +122,9 @@ def make_robot_reference(kind: type[RobotSimulator]) -> RobotReference:
 
 
 def _make_relative_path(folder: Path, path: Path) -> str:
-    """Return a path relative to a folder if both are in one tree, else the absolute path."""
+    """Return a path relative to a folder if they share a folder, else the absolute path."""
     folder, path = folder.resolve(), path.resolve()
+    # Paths on different drives of Windows have nothing in common.
     common = Path(os.path.commonpath([folder, path])) if folder.drive == path.drive else None
     # A relative path through the root of a file system would be valid on this machine only.
     if common is None or common == Path(common.anchor):
@@ -156,7 +163,15 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
 
 
 def _check_numerics(source: Source, value: Any) -> dict[str, Any]:
-    """Check the table ``[numerics]``: a time step in seconds, and options of MuJoCo's solver."""
+    """Check the table ``[numerics]``: a time step in seconds, and options of MuJoCo's solver.
+
+    Returns:
+        The entries. Words such as an integrator's name stay words; numbers of iterations become
+        integers.
+
+    Raises:
+        InputError: an entry is unknown, has the wrong type or is out of range.
+    """
     from sims.robot.integrator_settings import OPTION_EFFECTS, OPTION_WORDS
 
     settings = check_table(source, "numerics", value)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -187,7 +187,14 @@ class RobotSimulator(SystemSimulator):
         return self.engine.largest_step
 
     def _make_active_effects(self, theta: Array) -> ActiveEffects:
-        """Return active effects (`SystemSimulator`): free parameters first, families expanded."""
+        """Return the effects whose coefficients are not all zero, each at one place.
+
+        Effects of free parameters of the model come first; then those that the simulator was
+        created with. A family, one effect at all places, is divided into its members.
+
+        Args:
+            theta: (L, P) parameters: first the free ones, then coefficients of effects.
+        """
         acting: list[tuple[Effect, Array]] = []
         column = 0
         for effect in self._freed:
@@ -195,8 +202,8 @@ class RobotSimulator(SystemSimulator):
             acting.append((effect, theta[:, column : column + count].T[:, :, None]))
             column += count
         acting += super()._make_active_effects(theta)
-        parts = [part for effect, c in acting if c.any() for part in effect.parts(c)]
-        return tuple((effect, c) for effect, c in parts if c.any())
+        placed_effects = [placed for effect, c in acting if c.any() for placed in effect.parts(c)]
+        return tuple((effect, c) for effect, c in placed_effects if c.any())
 
     def get_active_effects(self, theta: Array) -> ActiveEffects:
         """Return the active effects at one place each, for rows of parameters.
@@ -214,10 +221,12 @@ class RobotSimulator(SystemSimulator):
     def _simulate_observations(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
-        """Simulate observations, see `SystemSimulator`; equal scenarios share their inputs.
+        """Simulate observations (L, T, C) of L batch elements, see `SystemSimulator`.
+
+        Elements with equal scenarios are one run, whose inputs are computed once.
 
         Args:
-            theta: (L, P) parameters of L batch elements.
+            theta: (L, P) parameters.
             scenarios: scenario of each element.
             initial: initial states by name, (L,) each.
         """
@@ -240,13 +249,15 @@ class RobotSimulator(SystemSimulator):
         x: Array,
         v: Array,
     ) -> Array:
-        """Simulate observations (L, T, C) of batch elements.
+        """Simulate observations (L, T, C) of L batch elements at T samples of C channels.
 
-        Shapes: L batch elements, T samples, C channels, D joints, K coefficients.
+        Elements are simulated together, up to `BATCH_SIZE`, if their effects need the same model.
+        Elements whose model MuJoCo rejects, or whose motion diverges, are NaN; so are samples
+        beyond the end of a shorter run.
 
         Args:
             acting: effects with coefficients (K, L, 1).
-            runs: scenarios of the elements.
+            runs: the distinct scenarios (runs), and the index of the scenario of each element.
             commands: values of each input, by name, of each distinct scenario.
             x: (L, D) initial positions.
             v: (L, D) initial velocities.
@@ -290,21 +301,22 @@ class RobotSimulator(SystemSimulator):
     def _simulate_run_batch(
         self, run_batches: Sequence[RobotRunBatch], acting: ActiveEffects
     ) -> list[Array]:
-        """Simulate observations (n, T, C) of the batch elements of each run, in one batch.
-
-        Shapes: T samples, C channels.
+        """Simulate the batch elements of several runs in one batch.
 
         Args:
             run_batches: batch elements of each run.
             acting: active effects with their coefficients for all batch elements, run after run.
+
+        Returns:
+            Observations (n, T, C) of each run: n elements, T samples, C channels.
         """
         # A sensor at the end needs a further step, since MuJoCo computes its reading within the
         # step that begins then.
         extra_steps = int(self._reads_sensors())
-        sizes = [self.count_steps(list_last_read_times(batch)) for batch in run_batches]
+        step_counts = [self.count_steps(list_last_read_times(batch)) for batch in run_batches]
         run_inputs = [
-            self.compute_controls(batch, size + extra_steps)
-            for batch, size in zip(run_batches, sizes, strict=True)
+            self.compute_controls(batch, count + extra_steps)
+            for batch, count in zip(run_batches, step_counts, strict=True)
         ]
         inputs = BatchInputs.concatenate(run_inputs)
         x = np.concatenate([batch.x for batch in run_batches])
@@ -314,24 +326,22 @@ class RobotSimulator(SystemSimulator):
         )
         observations = []
         first = 0
-        for batch, size in zip(run_batches, sizes, strict=True):
+        for batch, count in zip(run_batches, step_counts, strict=True):
             run_elements = slice(first, first + len(batch.x))
             observations.append(
-                self._compute_observations(stepped.select(run_elements), batch, batch.times, size)
+                self._compute_observations(stepped.select(run_elements), batch, batch.times, count)
             )
             first += len(batch.x)
         return observations
 
     def _get_floating_states(self, run_batches: Sequence[RobotRunBatch]) -> FloatingState:
-        """Return the initial states of floating bodies for all batch elements, run after run.
+        """Return the initial poses and velocities of floating bodies, run after run.
 
-        All batch elements of a run begin in the same state.
+        All batch elements of a run begin in the same state, which is repeated for each of them.
         """
-        initial_states = [self.get_floating_start(batch) for batch in run_batches]
+        poses, rates = zip(*map(self.get_floating_start, run_batches), strict=True)
         sizes = [len(batch.x) for batch in run_batches]
-        return FloatingState(
-            *(np.repeat(rows, sizes, axis=0) for rows in zip(*initial_states, strict=True))
-        )
+        return FloatingState(np.repeat(poses, sizes, axis=0), np.repeat(rates, sizes, axis=0))
 
     def get_floating_start(self, batch: RobotRunBatch) -> FloatingState:
         """Return the initial state of floating bodies, from the recording or the model file."""
@@ -362,15 +372,24 @@ class RobotSimulator(SystemSimulator):
     def compute_controls(self, batch: RobotRunBatch, steps: int) -> BatchInputs:
         """Compute the inputs of the batch elements of one run over all steps.
 
-        They are the controls of the actuators, the generalised forces on the joints that do
-        not depend on the state, and the activations of the filters before actuators.
+        The steps are:
+
+        1. Compute the applied inputs, the commands after effects such as a delay: their means over
+           the steps, which move the robot. If drive forces are recorded, also compute their values
+           at the beginnings of the steps, which a sensor of the drive force shows.
+        2. Write them into the controls of the actuators.
+        3. Add up the generalised forces on the joints that do not depend on the state.
+        4. Compute the activations of the filters before actuators.
+        5. Find the steps in which actuators are switched off.
 
         Args:
             batch: batch elements of the run.
             steps: number of steps.
         """
+        # 1. Applied inputs.
         batch_size = len(batch.x)
-        run_arguments = (
+        compute_inputs = partial(
+            compute_inputs_over_steps,
             self.time_step,
             batch.scenario,
             batch.commands,
@@ -378,22 +397,19 @@ class RobotSimulator(SystemSimulator):
             batch_size,
             steps,
         )
-        applied_inputs = compute_inputs_over_steps(*run_arguments)
-        instant = (
-            compute_inputs_over_steps(*run_arguments, SAME_INSTANT_SHARE)
-            if self._records_drive_forces
-            else applied_inputs
+        applied_inputs = compute_inputs()
+        initial_inputs = (
+            compute_inputs(SAME_INSTANT_SHARE) if self._records_drive_forces else applied_inputs
         )
-        step_starts: Array = self.time_step * np.arange(float(steps))
+        # 2. Controls.
         model = self.robot.compiled
         controls = np.zeros((batch_size, steps, model.nu))
-        forces = np.zeros((batch_size, steps, model.nv))
         instant_controls = np.zeros_like(controls) if self._records_drive_forces else controls
         for actuator in self.robot.actuators:
             name = f"u.{actuator.name}"
             controls[:, :, actuator.control] = applied_inputs[name]
             if self._records_drive_forces:
-                instant_controls[:, :, actuator.control] = instant[name]
+                instant_controls[:, :, actuator.control] = initial_inputs[name]
             # A derivative gain on the error's rate needs the rate of the command.
             if actuator.id in self._rate_controlled_actuators:
                 rate = (
@@ -402,29 +418,26 @@ class RobotSimulator(SystemSimulator):
                 )
                 controls[:, :, actuator.control + 1] = rate
                 instant_controls[:, :, actuator.control + 1] = rate
+        # 3. Forces.
+        forces = np.zeros((batch_size, steps, model.nv))
         for joint in self.robot.joints:
             if joint.has_one_coordinate:
                 forces[:, :, joint.velocity] = applied_inputs[f"force.{joint.name}"]
         dofs = self.addresses.velocities
+        step_starts: Array = self.time_step * np.arange(float(steps))
         forces[:, :, dofs] += compute_time_dependent_forces(
             self.robotic, batch.acting, step_starts, len(dofs), batch_size
         )
+        # 4. Activations.
         initial_activations = np.zeros((batch_size, model.na))
         for activation_filter in activation_filters(self.robot):
             filter_controls = controls[:, :, activation_filter.actuator.control]
-            initial_activations[:, activation_filter.address] = self._compute_initial_activation(
-                activation_filter, batch, filter_controls
-            )
+            initial = self._compute_initial_activation(activation_filter, batch, filter_controls)
+            initial_activations[:, activation_filter.address] = initial
             # The servo's effective set point is the activation instead of the command.
-            activations = self._integrate_activations(
-                activation_filter,
-                filter_controls,
-                initial_activations[:, activation_filter.address],
-            )
-            applied_inputs = {
-                **applied_inputs,
-                f"u.{activation_filter.actuator.name}": activations[:, :-1],
-            }
+            activations = self._integrate_activations(activation_filter, filter_controls, initial)
+            applied_inputs[f"u.{activation_filter.actuator.name}"] = activations[:, :-1]
+        # 5. Switched actuators.
         off_mask = compute_off_steps(self.robot, batch.scenario, self.time_step, steps)
         return BatchInputs(
             controls,
@@ -438,28 +451,29 @@ class RobotSimulator(SystemSimulator):
     def _compute_initial_activation(
         self, activation_filter: ActivationFilter, batch: RobotRunBatch, controls: Array
     ) -> Array:
-        """Return the activation (n,) of a filter at the start of a run.
+        """Return the activation (n,) of a filter at the start of a run, for n batch elements.
 
-        It is the value that the recording states; otherwise the result of the filter for
-        the known commands before the run; otherwise that of a filter that has settled at
-        the first command.
+        It is the first of these that is known:
 
-        Shapes: S steps.
+        1. the value that the recording states,
+        2. the result of the filter for the commands before the run,
+        3. the output of a filter that has settled at the first command.
 
         Args:
             activation_filter: filter: its actuator, time constant and kind.
             batch: batch elements of the run.
-            controls: (n, S) controls of the filter.
+            controls: (n, S) controls of the filter in the S steps of the run.
         """
-        file_activations = select_initial_activations(self.robot, batch.scenario.initial)
-        if activation_filter.state in file_activations:
-            return np.full(len(batch.x), file_activations[activation_filter.state])
-        settled_activation: Array = np.clip(
-            activation_filter.clip_controls(controls[:, 0]), *activation_filter.limits
-        )
+        stated_activations = select_initial_activations(self.robot, batch.scenario.initial)
+        if activation_filter.state in stated_activations:
+            return np.full(len(batch.x), stated_activations[activation_filter.state])
         history = extend_into_past(batch.scenario, self.time_step)
         if history is None:
+            settled_activation: Array = np.clip(
+                activation_filter.clip_controls(controls[:, 0]), *activation_filter.limits
+            )
             return settled_activation
+        # The filter has settled at the first of the commands before the run.
         scenario, steps = history
         commands = self.run_inputs(scenario)
         n = len(batch.x)
@@ -477,9 +491,7 @@ class RobotSimulator(SystemSimulator):
     def _integrate_activations(
         self, activation_filter: ActivationFilter, controls: Array, initial_activations: Array
     ) -> Array:
-        """Integrate an activation filter over the steps, as MuJoCo's integrator does.
-
-        Shapes: S steps.
+        """Integrate an activation filter over S steps, as MuJoCo's integrator does.
 
         Args:
             activation_filter: filter: its actuator, time constant and kind.
@@ -495,18 +507,22 @@ class RobotSimulator(SystemSimulator):
         )
 
     def run_initial(self, scenario: Scenario) -> dict[str, float]:
-        """Return initial states, see `Simulator`; filter activations are not estimated states."""
-        file_activations = select_initial_activations(self.robot, scenario.initial)
-        state_values = {
-            name: v for name, v in scenario.initial.items() if name not in file_activations
-        }
+        """Return the initial states of a run by name, see `Simulator`.
+
+        Activations of filters, which a recording may state too, are left out, since they are not
+        states of the system.
+        """
+        activations = select_initial_activations(self.robot, scenario.initial)
+        state_values = {name: v for name, v in scenario.initial.items() if name not in activations}
         return super().run_initial(replace(scenario, initial=state_values))
 
     def make_linearisation_batch(self, acting: ActiveEffects = ()) -> MujocoBatch:
         """Return the batch for linearisation, with the elements that effects add to the model.
 
+        Its elements are points of one motion, so all of them have the same effects.
+
         Args:
-            acting: effects active in the motion.
+            acting: effects active in the motion, with coefficients (K, 1, 1).
         """
         (added,) = group_by_added_elements(acting, 1)
         return self._get_batch(True, LINEARISATION_BATCH_SIZE, added)
@@ -537,9 +553,10 @@ class RobotSimulator(SystemSimulator):
     ) -> BatchResult:
         """Simulate a batch of n elements over all steps, and return its states and readings.
 
-        Effects are written into the fields of the model before. Those that depend on the state are
-        forces that are evaluated in each step, in MuJoCo's callback if they can be compiled,
-        otherwise between steps. Sensors of drives are corrected afterwards.
+        1. Select a batch of MuJoCo simulations whose model has the elements that effects add.
+        2. Write effects that are numbers of the model into it, and set the initial states.
+        3. Make the steps. Effects whose force depends on the state are evaluated in each of them.
+        4. Collect the states, and correct the readings of drive-force sensors.
 
         Args:
             start: initial states, and the active effects, which must all add the same elements to
@@ -547,6 +564,7 @@ class RobotSimulator(SystemSimulator):
             inputs: controls, forces and activations over the steps.
             extra_fields: additional fields of MuJoCo's data to record.
         """
+        # 1. Batch.
         batch_size = len(start.x)
         derived = bool(
             find_active_elements(start.acting, batch_size, changes_derived_constants).any()
@@ -556,6 +574,7 @@ class RobotSimulator(SystemSimulator):
         # one.
         mujoco_batch = self._get_batch(derived, 1 if batch_size == 1 else BATCH_SIZE, added)
         joints, series_joints = mujoco_batch.file_joints, mujoco_batch.series_joints
+        # 2. Effects and initial states.
         mujoco_batch.write_effects(
             pad_coefficients(
                 select_model_field_effects(start.acting), batch_size, mujoco_batch.count
@@ -563,6 +582,7 @@ class RobotSimulator(SystemSimulator):
         )
         initial_series = mujoco_batch.set_initial_state(start.x, start.v, start.floating_state)
         mujoco_batch.activate(inputs.activations)
+        # 3. Steps.
         field_names = ["qpos", "qvel", *extra_fields]
         if self._reads_sensors():
             field_names.append("sensordata")
@@ -584,6 +604,7 @@ class RobotSimulator(SystemSimulator):
             )
         else:
             recorded_fields = mujoco_batch.step(inputs.controls, forces, field_names, inputs.off)
+        # 4. States and readings. Recorded fields begin after the first step.
         x = np.concatenate(
             [start.x[:, None], recorded_fields["qpos"][:, :, joints.positions]], axis=1
         )
@@ -597,21 +618,15 @@ class RobotSimulator(SystemSimulator):
             )
             sensor_model.shift_to_step_begin(recorded_fields["sensordata"])
             sensor_model.add_drive_effects(recorded_fields["sensordata"], x, v, start.acting)
-        later_series = (
-            recorded_fields["qpos"][:, :, series_joints.positions],
-            recorded_fields["qvel"][:, :, series_joints.velocities],
+        series_x, series_v = initial_series
+        later_x = recorded_fields["qpos"][:, :, series_joints.positions]
+        later_v = recorded_fields["qvel"][:, :, series_joints.velocities]
+        series_states = (
+            np.concatenate([series_x[:, None], later_x], axis=1),
+            np.concatenate([series_v[:, None], later_v], axis=1),
         )
-        series_states = [
-            np.concatenate([first[:, None], later_values], axis=1)
-            for first, later_values in zip(initial_series, later_series, strict=True)
-        ]
         return BatchResult(
-            x,
-            v,
-            recorded_fields,
-            inputs.activations,
-            mujoco_batch.failed,
-            (series_states[0], series_states[1]),
+            x, v, recorded_fields, inputs.activations, mujoco_batch.failed, series_states
         )
 
     def _get_batch(self, derived: bool, count: int, added: AddedElements = ()) -> MujocoBatch:
@@ -630,26 +645,25 @@ class RobotSimulator(SystemSimulator):
     ) -> Array:
         """Compute the recorded observations (n, T, C) of one run, including sensor effects.
 
-        Each channel is interpolated from the steps to its sample times, with the slopes at the
-        steps, after the time shifts of its sensor effects.
-
-        Shapes: T samples, C channels.
+        Each of the C channels is interpolated from the steps to its T sample times, after the time
+        shifts of its sensor effects. Positions are interpolated with their slopes.
 
         Args:
-            result_of_batch: states and readings of the batch; failed elements become NaN.
+            result_of_batch: states and readings of the run's elements; failed ones become NaN.
             batch: the n batch elements of the run.
             times: (T,) sample times in seconds since the start.
             steps: number of steps of the run; the batch may have more.
         """
         columns = []
+        clock = float(batch.scenario.times[0])
         for channel in self.channels:
             values, slopes = self._get_channel_values(result_of_batch, channel.name, steps)
+            # An effect without a signal acts on all channels.
             sensors = tuple(
                 (e, c)
                 for e, c in batch.acting
                 if isinstance(e, Sensor) and e.signal in ("", channel.name)
             )
-            clock = float(batch.scenario.times[0])
             columns.append(sample_readings(values, slopes, self.time_step, times, sensors, clock))
         result = np.stack(columns, axis=2)
         result[result_of_batch.failed] = np.nan
@@ -658,22 +672,24 @@ class RobotSimulator(SystemSimulator):
     def _get_channel_values(
         self, result: BatchResult, name: str, steps: int
     ) -> tuple[Array, Array | None]:
-        """Return the values (n, S + 1) of a channel at all steps, and their slopes if known.
-
-        With the slopes, positions are interpolated more accurately between the steps.
+        """Return the values (n, S + 1) of a channel at the beginning and after each of S steps.
 
         Args:
             result: motion and recorded fields of n batch elements.
-            name: name of the channel.
+            name: name of the channel, such as ``q.elbow``.
             steps: number S of steps.
+
+        Returns:
+            The values, and for a position their slopes (n, S + 1), the velocities; otherwise None.
         """
         kind, _, element_name = name.partition(".")
         steps_of_run = slice(steps + 1)
         if kind in ("q", "qd"):
             number = self.system.coordinates.index(f"q.{element_name}")
+            velocities = result.v[:, steps_of_run, number]
             if kind == "q":
-                return result.x[:, steps_of_run, number], result.v[:, steps_of_run, number]
-            return result.v[:, steps_of_run, number], None
+                return result.x[:, steps_of_run, number], velocities
+            return velocities, None
         return result.fields["sensordata"][:, steps_of_run, self.get_sensor_address(name)], None
 
     def get_sensor_address(self, channel: str) -> int:

@@ -88,7 +88,14 @@ class RobotSystem(System):
     def close_loops(
         cls, states: Mapping[str, float], measured: Collection[str]
     ) -> dict[str, float]:
-        """Return states in which the loops of the robot are closed, see `System`."""
+        """Return states in which the loops of the robot are closed, see `System`.
+
+        Joints in loops that are not measured are placed where the loops put them.
+
+        Args:
+            states: initial states by name.
+            measured: names of the measured positions, such as ``q.crank``.
+        """
         in_loops = sorted(set().union(*cls.loops))
         names = [cls.coordinates[coordinate].removeprefix("q.") for coordinate in in_loops]
         unmeasured = [name for name in names if f"q.{name}" not in measured]
@@ -96,10 +103,14 @@ class RobotSystem(System):
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
-        """Return the effect at each of its places, without effects that are free parameters.
+        """Return the classes of an effect at each of its places, and of its family, if any.
 
+        Left out are places where the effect's coefficient is a free parameter of the simulator.
         A payload is also left out on a body whose mass is free, since the log cannot tell the
         two masses apart.
+
+        Args:
+            effect: registered effect.
         """
         if effect.name not in cls._placed:
             cls._placed[effect.name] = tuple(
@@ -122,12 +133,12 @@ class RobotSystem(System):
 
     @classmethod
     def _compiles_with(cls, effect: type[Effect]) -> bool:
-        """Return whether the model with an effect at one place compiles.
+        """Return whether the model compiles with the elements that an effect at one place adds.
 
-        If not, MuJoCo's reason is stored in `left_out`.
+        If not, MuJoCo's reason is stored in `left_out` for messages.
         """
         added = list_added_elements(effect)
-        # A pair of existing geoms always compiles.
+        # Most effects add no elements, and a pair of existing geoms always compiles.
         if not added or effect.pairs:
             return True
         error = find_compile_error(cls.robot, added)
@@ -145,8 +156,12 @@ class RobotSystem(System):
     def effect(cls, name: str) -> type[Effect] | None:
         """Find the effect with a name such as ``friction.coulomb@elbow``.
 
-        The place may be left out for effects without places, be `ALL_PLACES` for the family, or be
-        the name of a link that was fused into a body.
+        The place after ``@`` may be
+
+        * left out for an effect without places,
+        * a joint, actuator, body or channel, or a link that was fused into a body,
+        * `ALL_PLACES` for the family, the effect at all places,
+        * any contact of two geoms, or any geom with a radius, also without a recorded contact.
 
         Args:
             name: Name of the effect, with its place after ``@``.
@@ -157,7 +172,7 @@ class RobotSystem(System):
         """
         effect_name, _, place = name.partition("@")
         registered = library.get_effect(effect_name)
-        cls.placed(registered)
+        cls.placed(registered)  # fills `left_out` and `_placed`
         if name in cls.left_out:
             raise InputError(f"effect {name} of robot {cls.name}: {cls.left_out[name]}")
         effects_by_name = {
@@ -166,7 +181,7 @@ class RobotSystem(System):
         if name in effects_by_name:
             return effects_by_name[name]
         if registered.at == "contact" and PAIR_SEPARATOR in place:
-            # The contacts of a recording are candidates, but any contact may be named.
+            # The contacts of a recording have effects already, but any contact may be named.
             effect_place = make_contact_place(cls.robot, place, (place,))
             return placed_effect_classes.make_placed_effect(registered, effect_place)
         if registered.at == "geom" and place not in ("", ALL_PLACES):
@@ -195,12 +210,16 @@ class RobotSystem(System):
     def find_freeable_effects(cls, word: str) -> list[type[Effect]]:
         """Return the effects whose coefficients an entry of ``--free`` refers to.
 
-        Such an entry names a number of the model file that is to be tuned. For all places, it is
-        one number at each place, except for effects that all places share.
+        Such an entry names a number of the model file that is to be tuned. For all places, the
+        result is one effect for each place, except for effects with one number that all places
+        share.
 
         Args:
             word: name in MuJoCo's words such as ``damping@elbow``, or effect such as
                 ``drag.linear@elbow``; ``@*`` is every place.
+
+        Raises:
+            InputError: there is no such number, or it has no such place.
         """
         base, _, place = word.partition("@")
         name = MUJOCO_EFFECT_WORDS.get(base, base)
@@ -239,10 +258,11 @@ class RobotSystem(System):
 
 
 def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[RobotSystem]:
-    """Make the system of a robot.
+    """Make the system of a robot, a class that depends on the model file.
 
-    The system tells tuners and effects what the robot has: coordinates, inputs, channels and
-    initial states, by the names of its joints and actuators.
+    It tells tuners and effects what the robot has: coordinates, inputs, channels and initial
+    states, by the names of its joints and actuators. The attributes are those of `System` and
+    `RobotSystem`.
 
     Args:
         robot: robot as read from its model file.
@@ -253,10 +273,11 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     """
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     if not joints:
-        free = robot.joints[0].name
+        floating_joint = robot.joints[0].name
         raise InputError(
             f"{robot.path}: expected a hinge or slide joint, found none that moves; if the pose of "
-            f"the body is recorded, state it as channels q.{free}.x, y, z, qw, qx, qy, qz"
+            "the body is recorded, state it as channels "
+            f"q.{floating_joint}.x, y, z, qw, qx, qy, qz"
         )
     channels = _list_channels(robot)
     inputs = [Channel(f"u.{a.name}", a.control_unit) for a in robot.actuators]
@@ -317,6 +338,8 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), attributes)
     if not free:
         return system
+    # The names in `free` are resolved by the system without free parameters. The class is then made
+    # again, so that its caches of effects are empty.
     effects = list_freed_effects(system, free)
     attributes["freed_parameters"] = frozenset(effect.name for effect in effects)
     attributes["parameters"] = tuple(p for effect in effects for p in _make_parameters(effect))
@@ -347,18 +370,23 @@ FREED_GAIN_RANGE_FACTOR = 9.0
 
 
 def _make_parameters(effect: type[Effect]) -> list[Parameter]:
-    """Make parameters from an effect's coefficients; nominal values keep the file's values."""
+    """Make parameters of the simulator from an effect's coefficients.
+
+    A coefficient is a change of a number of the model file. Its nominal value zero keeps the file's
+    number, and its bounds are a multiple of the plausible range.
+    """
     parameters = []
     for coefficient in effect.coefficients:
+        # Units and ranges are equal for all kinds of systems, since the effect is at one place.
         low, high = coefficient.plausible[0]
-        # A free gain is a guess, so the true value may be several times as large.
+        # The gain of a servo is often a guess, so the true value may be several times as large.
         is_free_gain = effect.at == "actuator" and coefficient.least is not None
         bounds = (
             FREED_RANGE_FACTOR * low,
             FREED_GAIN_RANGE_FACTOR if is_free_gain else FREED_RANGE_FACTOR * high,
         )
-        # A coefficient that cannot be observed has an empty range; it gets wider bounds, and the
-        # data will not identify it.
+        # Bounds stay within the limits of the coefficient. Equal limits mean that it cannot be
+        # observed; it keeps the wider bounds, and the data will not identify it.
         if coefficient.least is not None and coefficient.least != coefficient.most:
             upper_limit = np.inf if coefficient.most is None else coefficient.most
             bounds = max(bounds[0], coefficient.least), min(bounds[1], upper_limit)

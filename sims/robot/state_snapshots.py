@@ -29,7 +29,7 @@ class SingleSlideSystem(SingleJointSystem):
 
 @dataclass
 class JointSnapshot(StateSnapshot):
-    """State of one joint at one time.
+    """State of one joint at one time, for L batch elements.
 
     Attributes:
         carried: (2, L, 1) forces on both sides of its transmission: the drive, and the load.
@@ -111,10 +111,14 @@ class RobotSnapshot(StateSnapshot):
     def get_joint_snapshot(self, joint: int) -> JointSnapshot:
         """Return the state of one joint in the form of a system with one coordinate.
 
-        Effects are written for such systems. The set point is NaN without a position servo
-        whose input is known.
+        Effects are written for such systems. The snapshot has only the inputs of the joint's
+        actuators. Without a position servo whose input is known, its set point is NaN and its
+        stiffness zero.
+
+        Args:
+            joint: index of the joint's coordinate.
         """
-        joint_slice = slice(joint, joint + 1)
+        joint_slice = slice(joint, joint + 1)  # keeps the axis of the joints
         inputs = {
             name: self.inputs[name] for name in self.drives.get(joint, ()) if name in self.inputs
         }
@@ -128,8 +132,8 @@ class RobotSnapshot(StateSnapshot):
             self.x[:, joint_slice],
             self.v[:, joint_slice],
             inputs,
-            self.carried[:, :, joint_slice],
-            self.inputs[servo] if has_servo and servo else np.full_like(self.t, np.nan),
-            self.stiffness[:, joint_slice] if has_servo else np.zeros_like(self.t),
-            self.system.gear(joint),
+            carried=self.carried[:, :, joint_slice],
+            goal=self.inputs[servo] if has_servo and servo else np.full_like(self.t, np.nan),
+            stiffness=self.stiffness[:, joint_slice] if has_servo else np.zeros_like(self.t),
+            gear=self.system.gear(joint),
         )

@@ -65,24 +65,24 @@ class ActivationFilter(NamedTuple):
     def compute_activations(
         self, controls: Array, initial: Array, step: float, is_rk4: bool
     ) -> Array:
-        """Compute the filter's outputs, its activations, at the beginnings of steps.
+        """Compute the filter's outputs, its activations, at the beginnings of S steps.
 
-        The activation approaches the control by the share h / T in each step (Euler's method) or by
-        1 - exp(-h / T) (exactly), with the step length h and the time constant T.
-
-        Shapes: S steps.
+        In each step of length h, the activation approaches the control by the share h / T (Euler's
+        method), with the time constant T; or by 1 - exp(-h / T) if the filter is exact, or if the
+        integrator is Runge-Kutta 4, which agrees with it to fourth order.
 
         Args:
             controls: (n, S) controls of the steps.
             initial: (n,) initial activations.
-            step: step length in seconds.
-            is_rk4: whether the integrator is of fourth order, for which (1) and (2) agree.
+            step: step length h in seconds.
+            is_rk4: whether the integrator is Runge-Kutta 4.
 
         Returns:
             (n, S + 1) activations; the last one is after the last step.
         """
         ratio = step / max(self.seconds, MIN_TIME_CONSTANT)
         retained_share = float(np.exp(-ratio)) if self.exact or is_rk4 else 1.0 - ratio
+        # The recursion a[k+1] = decay a[k] + (1 - decay) u[k].
         inputs = self.clip_controls(controls)
         decay = np.full_like(inputs, retained_share)
         end_activations = run_recursion(LINEAR, decay, (1.0 - decay) * inputs, initial[:, None])
@@ -97,26 +97,23 @@ class ActivationFilter(NamedTuple):
 
 @cache_per_robot
 def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
-    """Return the filters before those actuators of a robot that have one control.
+    """Return the filters before actuators of a robot, which delay a control by a first-order lag.
 
-    MuJoCo's types `filter` and `filterexact` delay a control by a first-order lag. Actuators with
-    two controls (a set point and its rate) and those without a filter are left out.
-
-    Args:
-        robot: Robot with its compiled model.
+    They have MuJoCo's types `filter` and `filterexact`. Filters of actuators with two controls (a
+    set point and its rate) are left out.
     """
     import mujoco
 
     model = robot.compiled
     filterexact_id = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
-    filters_found = []
+    activation_filters_of_robot = []
     for actuator in robot.actuators:
         actuator_id = actuator.id
         if int(model.actuator_dyntype[actuator_id]) not in filters() or actuator.controls != 1:
             continue
         is_limited = bool(model.actuator_actlimited[actuator_id])
         low, high = model.actuator_actrange[actuator_id] if is_limited else (-np.inf, np.inf)
-        filters_found.append(
+        activation_filters_of_robot.append(
             ActivationFilter(
                 actuator=actuator,
                 address=int(model.actuator_actadr[actuator_id]),
@@ -125,7 +122,7 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
                 limits=(float(low), float(high)),
             )
         )
-    return tuple(filters_found)
+    return tuple(activation_filters_of_robot)
 
 
 def select_initial_activations(robot: RobotModel, initial: Mapping[str, float]) -> dict[str, float]:
@@ -156,8 +153,9 @@ def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | 
     """Extend a scenario into the time before the run for which its inputs are known.
 
     A filter's initial activation follows from the commands before the run. A recording may contain
-    them, if the run is a part of a longer one. The extended scenario begins a whole number of steps
-    earlier, so that the run's own steps stay the same.
+    them, if the run is a part of a longer one: `Scenario.before` has, for each input, their times
+    (negative, in seconds before the run) and values. The extended scenario begins a whole number of
+    steps earlier, so that the run's own steps stay the same.
 
     Args:
         scenario: scenario of the run.
@@ -167,14 +165,12 @@ def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | 
         The scenario that begins a whole number of steps earlier, and this number; None if the
         inputs before the run are not known for at least one step.
     """
-    names = [name for name in scenario.inputs if name in scenario.before]
-    earlier_times = scenario.before[names[0]][0] if names else np.empty(0)
+    known_inputs = [scenario.before[name] for name in scenario.inputs if name in scenario.before]
+    earlier_times = known_inputs[0][0] if known_inputs else np.empty(0)
     steps = int(np.floor(-earlier_times[0] / step)) if earlier_times.size else 0
     # The inputs of one run must be known at equal times.
-    have_equal_times = all(
-        np.array_equal(scenario.before[name][0], earlier_times) for name in names
-    )
-    if steps < 1 or len(names) < len(scenario.inputs) or not have_equal_times:
+    have_equal_times = all(np.array_equal(times, earlier_times) for times, _ in known_inputs)
+    if steps < 1 or len(known_inputs) < len(scenario.inputs) or not have_equal_times:
         return None
     start_time = -steps * step
     is_included = earlier_times > start_time
@@ -183,7 +179,9 @@ def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | 
     )
     inputs = {}
     for name, values in scenario.inputs.items():
-        earlier_values = scenario.before[name][1]
+        _, earlier_values = scenario.before[name]
+        # The value at the start time, which lies between two earlier times: interpolated for a
+        # piecewise linear input, else the last earlier value.
         if name in scenario.linear:
             ends = np.append(earlier_times, 0.0), np.append(earlier_values, values[0])
             initial = float(np.interp(start_time, *ends))

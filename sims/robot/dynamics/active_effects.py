@@ -81,12 +81,16 @@ class StepEffects(NamedTuple):
 
     @classmethod
     def from_active(cls, acting: ActiveEffects) -> StepEffects:
-        """Select and sort effects at one place each; see `is_evaluated_per_step`."""
-        own = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
+        """Select the effects that must be evaluated in every step, and sort them by their kind.
+
+        Args:
+            acting: effects at one place each, with coefficients (K, L, 1).
+        """
+        selected = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
         return cls(
-            tuple((e, c) for e, c in own if isinstance(e, Force)),
-            tuple((e, c) for e, c in own if isinstance(e, Friction)),
-            tuple((e, c) for e, c in own if isinstance(e, HiddenStateEffect)),
+            tuple((e, c) for e, c in selected if isinstance(e, Force)),
+            tuple((e, c) for e, c in selected if isinstance(e, Friction)),
+            tuple((e, c) for e, c in selected if isinstance(e, HiddenStateEffect)),
         )
 
     @property
@@ -95,7 +99,12 @@ class StepEffects(NamedTuple):
         return np.concatenate([c[:, :, 0] for group in self for _, c in group])
 
     def with_coefficients(self, rows: Any) -> StepEffects:
-        """Return the effects with other coefficients (L, K), in the order of `coefficients`."""
+        """Return the effects with other coefficients.
+
+        Args:
+            rows: (L, K) coefficients of all effects for L batch elements, in the order of
+                `coefficients`.
+        """
         ends = np.cumsum([len(effect.coefficients) for group in self for effect, _ in group])
         parts = iter(np.split(rows, ends[:-1], axis=1))
         groups: Any = (
@@ -107,21 +116,17 @@ class StepEffects(NamedTuple):
 def find_active_elements(
     acting: ActiveEffects, count: int, which: Callable[[Effect], bool]
 ) -> Mask:
-    """Find the batch elements in which a selected effect is active.
+    """Find the batch elements in which an effect of some kind is active.
 
-    It is called to decide which batch elements can be simulated together, for example those in
-    which an effect depends on the state. An effect with only zero coefficients counts as
-    absent.
-
-    Shapes: K coefficients.
+    An effect is active in an element if any of its coefficients is not zero there.
 
     Args:
         acting: effects with their coefficients (K, L, 1).
         count: number L of batch elements.
-        which: returns whether an effect is selected.
+        which: returns whether an effect is of this kind, such as `is_evaluated_per_step`.
 
     Returns:
-        (L,) whether any selected effect has a nonzero coefficient.
+        (L,) whether any effect of this kind is active.
     """
     is_active = np.zeros(count, dtype=bool)
     for effect, c in acting:

@@ -43,41 +43,45 @@ def group_by_added_elements(acting: ActiveEffects, count: int) -> dict[AddedElem
     Each group needs a model and a batch of its own. Batch elements without such effects are a group
     too, with the key ().
 
-    Shapes: K coefficients.
-
     Args:
         acting: effects with their coefficients (K, L, 1).
         count: number L of batch elements.
+
+    Returns:
+        Indices of the batch elements of each group, by the elements to add to the model.
     """
-    needs = [
+    # Elements that an effect adds, and in which batch elements (L,) the effect is active. An effect
+    # in series with a joint is off where its first coefficient is not above zero.
+    additions = [
         (added, np.where(is_series_effect(e), c[0] > 0, c.any(axis=0))[:, 0])
         for e, c in acting
         if (added := list_added_elements(e))
     ]
-    batch_indices: dict[AddedElements, list[int]] = {}
+    groups: dict[AddedElements, list[int]] = {}
     for batch_index in range(count):
-        # Effects may share an element.
+        # Several effects may add one element, which counts once.
         elements = dict.fromkeys(
-            element for added, is_on in needs if is_on[batch_index] for element in added
+            element for added, is_active in additions if is_active[batch_index] for element in added
         )
-        batch_indices.setdefault(tuple(elements), []).append(batch_index)
-    return batch_indices
+        groups.setdefault(tuple(elements), []).append(batch_index)
+    return groups
 
 
 def add_elements(robot: RobotModel, added: AddedElements) -> RobotModel:
-    """Add elements to a robot, without changing element names.
+    """Add pairs of geoms, tendons of coupled drives and joints in series to a robot.
 
-    They change no motion until effects write their numbers.
+    They change no motion until effects write their numbers. Names of elements do not change.
 
     Args:
         robot: robot as read from its model file.
-        added: the elements; with none of them, the robot itself is returned.
+        added: the elements as pairs of place and effect (or a placeholder); with none of them, the
+            robot itself is returned.
     """
     robot = add_contact_pairs(robot, [place for place, effect in added if effect == CONTACT_PAIR])
     if COUPLING_PLACEHOLDER in added:
         robot = make_coupled_robot(robot, dict.fromkeys(list_coupling_places(robot), 0.0))
     series: SeriesJoints = tuple(
-        one for one in added if one[1] not in (CONTACT_PAIR, COUPLING_EFFECT)
+        (place, effect) for place, effect in added if effect not in (CONTACT_PAIR, COUPLING_EFFECT)
     )
     return add_series_joints(robot, series) if series else robot
 
@@ -86,9 +90,11 @@ def add_elements(robot: RobotModel, added: AddedElements) -> RobotModel:
 def find_compile_error(robot: RobotModel, added: AddedElements) -> str:
     """Return why the model with added elements does not compile; empty if it does.
 
+    The model is compiled without shapes, which takes little time.
+
     Args:
         robot: robot as read from its model file.
-        added: joints in series and tendons; the model is compiled without shapes.
+        added: joints in series and tendons, as pairs of place and effect.
     """
     try:
         add_elements(strip_shapes(robot), added).compiled  # noqa: B018

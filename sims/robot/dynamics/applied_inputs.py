@@ -90,13 +90,19 @@ class RunInputs(NamedTuple):
     def get_step_fractions(self, step: float, share: float, is_changed: bool) -> Array:
         """Return the fractions of a step at which it is divided to compute mean inputs.
 
-        A step is divided into quarters, so that a command that changes within it has the right
-        time. It is not divided if nothing changes within steps.
+        The cases are:
+
+        * An input that is averaged over the first part of a step only: the end of this part.
+        * Commands that change at the ends of steps only, without input effects: no division.
+        * Otherwise quarters, so that a command that changes within a step has the right time.
 
         Args:
             step: step length in seconds.
-            share: share of each step over which the input is averaged.
-            is_changed: whether effects change the inputs, within a step or at its ends.
+            share: share of each step, from its beginning, over which the input is averaged.
+            is_changed: whether effects change the inputs, at any time within a step.
+
+        Returns:
+            Ends of the parts of a step as shares of its length, ascending; the last one is 1.
         """
         if share < 1.0:
             return np.array([share, 1.0])
@@ -108,17 +114,18 @@ class RunInputs(NamedTuple):
         return NO_SUBDIVISION if is_aligned and not is_changed else STEP_SUBDIVISION
 
     def find_steps_with_sample(self, step: float) -> Mask:
-        """Return whether a sample is at the beginning of the first step and each step end (S + 1,).
-
-        Shapes: S steps.
+        """Find the ends of steps that are nearest to a sample of the run.
 
         Args:
             step: step length in seconds.
+
+        Returns:
+            (S + 1,) whether a sample is at the beginning of the first step, and at the end of each
+            of the S steps.
         """
+        nearest_ends = np.rint(self._get_sample_times_in_steps(step)).astype(np.intp)
         has_sample = np.zeros(self.steps + 1, dtype=bool)
-        has_sample[
-            np.clip(np.rint(self._get_sample_times_in_steps(step)).astype(np.intp), 0, self.steps)
-        ] = True
+        has_sample[np.clip(nearest_ends, 0, self.steps)] = True
         return has_sample
 
     def _get_sample_times_in_steps(self, step: float) -> Array:
@@ -144,8 +151,6 @@ def compute_inputs_over_steps(
     the commands without effects, which are cached; then the inputs that effects change replace
     them.
 
-    Shapes: T samples, K coefficients.
-
     Args:
         step: step length in seconds.
         scenario: scenario of the run.
@@ -154,7 +159,8 @@ def compute_inputs_over_steps(
         n: number of batch elements.
         steps: number S of steps.
         share: share of each step, from its beginning, over which the input is averaged. The default
-            1.0 gives the value to apply over the whole step.
+            1.0 gives the value to apply over the whole step; `SAME_INSTANT_SHARE` gives the value
+            at the beginning of the step.
 
     Returns:
         Applied inputs (n, S) by name.
@@ -165,14 +171,17 @@ def compute_inputs_over_steps(
     applied_inputs: dict[str, Array] = {}
     for name, signal in commands.items():
         earlier = scenario.before[name].tobytes() if name in scenario.before else b""
-        interpolation = name in scenario.linear, scenario.offset, earlier
+        # Everything on which the applied input depends.
         key = (
             step,
             steps,
             fractions.tobytes(),
-            *interpolation,
+            name in scenario.linear,
+            scenario.offset,
+            earlier,
             _compute_signal_digest(scenario.times, signal),
         )
+        # One batch element without effects stands for all.
         request = _InputRequest(0, scenario, name, signal, np.zeros(1, dtype=np.intp), ())
         unchanged = _applied_input_cache.get(
             key, partial(_compute_applied_inputs, step, [request], steps, has_sample, fractions)
@@ -190,9 +199,8 @@ def compute_changed_inputs(
 
     Effects with a state, such as a lag, are integrated step by step, and a step costs about the
     same for few and for many batch elements. So inputs are collected from all runs, grouped by
-    equal step times and equal effects, and each group is integrated at once.
-
-    Shapes: L batch elements, S steps.
+    equal step times and equal effects, and each group is integrated at once. Inputs and batch
+    elements without effects are left out.
 
     Args:
         step: step length in seconds.
@@ -200,8 +208,10 @@ def compute_changed_inputs(
         share: as in `compute_inputs_over_steps`.
 
     Yields:
-        Number of the run, name of the input, batch elements (L,), and their applied inputs (L, S).
+        Number of the run, name of the input, indices of some of the run's batch elements (L,), and
+        their applied inputs (L, S) over S steps.
     """
+    # 1. Collect one request for each input and group of batch elements with the same effects on it.
     requests_by_grid: dict[tuple[int, bytes, bytes], list[_InputRequest]] = {}
     for run_index, run in enumerate(runs):
         fractions = run.get_step_fractions(step, share, is_changed=True)
@@ -213,12 +223,13 @@ def compute_changed_inputs(
             input_effects = tuple(
                 (e, c) for e, c in run.acting if isinstance(e, Input) and e.signal == name
             )
-            # Inputs are grouped by effects, so that the value of a batch element does not depend on
-            # others.
+            # Each element is evaluated with its own effects only, so that its value does not depend
+            # on other elements.
             requests += [
                 _InputRequest(run_index, run.scenario, name, signal, *part)
                 for part in _group_by_active_effects(input_effects, run.n)
             ]
+    # 2. Evaluate the requests, and divide the results again.
     for (steps, fraction_bytes, sample_bytes), requests in requests_by_grid.items():
         fractions = np.frombuffer(fraction_bytes)
         has_sample = np.frombuffer(sample_bytes, dtype=bool)
@@ -268,8 +279,6 @@ def _group_by_active_effects(
 ) -> Iterator[tuple[IndexArray, ActiveEffects]]:
     """Group n batch elements by the effects that act on them, without elements on which none acts.
 
-    Shapes: K coefficients.
-
     Args:
         input_effects: effects with coefficients (K, n, 1); one with zeros only does not act.
         n: number of batch elements.
@@ -277,24 +286,26 @@ def _group_by_active_effects(
     Yields:
         Indices of a group's elements, and the effects with the coefficients of these elements.
     """
-    # Row e, column l: whether effect e acts on batch element l.
+    # Row e, column l: whether effect e acts on batch element l; also valid without effects.
     is_active = np.array([(c != 0).any(axis=(0, 2)) for _, c in input_effects], dtype=bool).reshape(
         -1, n
     )
-    patterns, pattern_of_element = np.unique(is_active, axis=1, return_inverse=True)
-    for number, pattern in enumerate(patterns.T):
-        if pattern.any():
-            batch_indices = np.flatnonzero(pattern_of_element.ravel() == number)
+    # Each distinct column is one combination of effects.
+    combinations, combination_of_element = np.unique(is_active, axis=1, return_inverse=True)
+    for number, combination in enumerate(combinations.T):
+        if combination.any():
+            batch_indices = np.flatnonzero(combination_of_element.ravel() == number)
             yield batch_indices, slice_active_effects(input_effects, batch_indices)
 
 
 def _group_requests(requests: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
-    """Group requests with equal types of effects, at most `MAX_BATCH_SIZE` elements each.
+    """Group requests with equal types of effects, of about `MAX_BATCH_SIZE` batch elements each.
 
     A group is evaluated in one batch, with one effect function per effect and one row per element.
+    A request is not divided, so that a group may be larger than `MAX_BATCH_SIZE` by one request.
 
     Args:
-        requests: Inputs of runs with their active effects.
+        requests: requests for inputs, with the effects that act on them.
     """
     requests_by_effects: dict[tuple[str, ...], list[_InputRequest]] = {}
     for request in requests:
@@ -302,10 +313,11 @@ def _group_requests(requests: Sequence[_InputRequest]) -> Iterator[list[_InputRe
             request
         )
     for group in requests_by_effects.values():
-        sizes = np.cumsum([request.batch_indices.size for request in group])
-        parts = (sizes - 1) // MAX_BATCH_SIZE
-        for part in np.unique(parts):
-            yield [group[k] for k in np.flatnonzero(parts == part)]
+        # A request belongs to the part in which its last element lies.
+        ends = np.cumsum([request.batch_indices.size for request in group])
+        part_of_request = (ends - 1) // MAX_BATCH_SIZE
+        for part in np.unique(part_of_request):
+            yield [group[k] for k in np.flatnonzero(part_of_request == part)]
 
 
 def _concatenate_effects(requests: Sequence[_InputRequest]) -> ActiveEffects:
@@ -325,17 +337,17 @@ def _compute_applied_inputs(
     """Compute the input that each request applies over each step, (N, S) for N batch elements.
 
     The requests are integrated as one batch on a time grid that divides each step at `fractions`,
-    because delays and filters act within a step. The parts are then combined to one value per step.
+    because delays and filters act within a step. Quarters (`STEP_SUBDIVISION`) are then combined to
+    one value per step. With fewer parts, the value of the first part is returned: it is the whole
+    step, or the beginning of the step that was asked for.
 
     Args:
         step: step length in seconds.
-        requests: N requests of an input of a run.
+        requests: requests with equal types of effects, N batch elements in all.
         steps: number S of steps.
         has_sample: (S + 1,) whether a sample is at the beginning of the first step and at each
             step's end.
-        fractions: times in a step, as shares of its length, at which it is divided for delays and
-            filters. With those of `STEP_SUBDIVISION` the parts are combined to one value per step;
-            with fewer fractions, the first part is returned.
+        fractions: ends of the parts of a step, as shares of its length.
     """
     acting = _concatenate_effects(requests)
     run_of_element = np.repeat(
@@ -365,7 +377,7 @@ def _make_subdivided_grid(
         step: step length in seconds.
         steps: number of steps.
         n: number of batch elements.
-        fractions: times in a step, as shares of its length.
+        fractions: ends of the parts of a step, as shares of its length.
         has_uniform_steps: whether all parts are declared to have equal length.
     """
     begins: Array = step * np.arange(float(steps))
@@ -386,19 +398,22 @@ def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
 
         D = 1 / h^2 times the integral of (s - h / 2) u(s)                                 (1)
 
-    is reproduced by adding -D to the step and +D to the next one. If a sample is at the end of the
-    step and none at its beginning, -D is added to the previous step and +D to this one, since only
-    the states at samples are observed.
+    is reproduced by two neighbouring steps together. Between them the state is wrong, so no sample
+    may be there:
 
-    Shapes: S steps.
+    * Without a sample at the end of the step, -D is added to the step and +D to the next one.
+    * With a sample at its end and none at its beginning, -D is added to the previous step and +D to
+      this one.
+    * With samples at both ends, nothing is added.
 
     Args:
         parts: (n, S, 4) means over the quarters.
         has_sample: (S + 1,) whether a sample is at the beginning of the first step and at each step
             end.
     """
-    weights = (np.arange(4.0) + 0.5) / 4.0 - 0.5
-    moments = parts @ (weights / 4.0)  # (1)
+    # Distances of the middles of the quarters from the middle of the step, in steps.
+    distances = (np.arange(4.0) + 0.5) / 4.0 - 0.5
+    moments = parts @ (distances / 4.0)  # (1)
     means: Array = parts @ np.full(4, 0.25)
     last = parts.shape[1] - 1
     # Direction of the step that shares the moment: 1 for the next one, -1 for the previous one.

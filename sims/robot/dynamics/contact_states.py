@@ -110,13 +110,13 @@ class ContactModel:
         self._bodies: list[int] = self._model.geom_bodyid.tolist()
 
     def begin_run(self, scenario: Scenario, x: Array, v: Array) -> None:
-        """Set the inputs of the beginning of a run.
+        """Set the inputs at the beginning of a run: first controls, forces and activations.
 
-        The contacts that MuJoCo then finds in the initial pose are those of the run.
+        Later calls of `evaluate` hold them, whatever the state is.
 
         Args:
             scenario: scenario of the run, whose first commands act.
-            x: (D,) initial positions of the joints.
+            x: (D,) initial positions of the joints, on which activations may depend.
             v: (D,) initial velocities.
         """
         import mujoco
@@ -136,6 +136,9 @@ class ContactModel:
         The derivative of a contact point's velocity, du/dt = J a + (dJ/dt) v, needs the change of
         its Jacobian J with time. It is the difference to the Jacobian after the robot has moved by
         one time step; a contact that no longer exists there counts as unchanged.
+
+        Returns:
+            The contacts by their two geoms and a number.
         """
         import mujoco
 
@@ -146,25 +149,24 @@ class ContactModel:
         mujoco.mj_forward(model, data)
         v, a = data.qvel.copy(), data.qacc.copy()
         contacts = self._compute_jacobians()
-        distances = {key: (dist, closed) for key, (_, dist, closed) in contacts.items()}
         mujoco.mj_integratePos(model, data.qpos, v, model.opt.timestep)
         mujoco.mj_fwdPosition(model, data)
-        moved = self._compute_jacobians()
+        contacts_after_step = self._compute_jacobians()
         result = {}
-        for key, (jacobian, *_) in contacts.items():
-            later = moved[key][0] if key in moved else jacobian
-            acceleration = jacobian @ a + (later - jacobian) @ v / model.opt.timestep
-            result[key] = _Contact(
-                jacobian @ v, acceleration, *distances[key], jacobian[0, joints.velocities]
-            )
+        for key, (jacobian, distance, is_closed) in contacts.items():
+            later_jacobian, *_ = contacts_after_step.get(key, (jacobian,))
+            acceleration = jacobian @ a + (later_jacobian - jacobian) @ v / model.opt.timestep
+            normal = jacobian[0, joints.velocities]
+            result[key] = _Contact(jacobian @ v, acceleration, distance, is_closed, normal)
         return result
 
     def _compute_jacobians(self) -> dict[_Key, tuple[Array, float, bool]]:
-        """Return Jacobian (n, nv), distance, and whether it is closed, for each contact.
+        """Return Jacobian (n, nv), distance in m, and whether it is closed, for each contact.
 
-        The Jacobian maps the velocities (nv,) of the robot to that of one geom against the other at
-        the contact point, in the frame of the contact: along its normal first, and, with friction,
-        along two tangents. A closed contact exerts a force.
+        The Jacobian maps the velocities (nv,) of the robot to that of the second geom against the
+        first one at the contact point, in the frame of the contact: along its normal (n = 1), and,
+        with friction, along two tangents (n = 3). A closed contact exerts a force. The key of a
+        contact is its two geoms, and its number among the contacts of these geoms.
         """
         import mujoco
 
@@ -173,15 +175,16 @@ class ContactModel:
         jacobians = np.zeros((2, 3, model.nv))
         # A field of all contacts is much faster to read than one contact after another.
         every = data.contact
-        frames, places, dims = every.frame.reshape(-1, 3, 3), every.pos, every.dim.tolist()
+        frames, points, dims = every.frame.reshape(-1, 3, 3), every.pos, every.dim.tolist()
         distances, addresses = every.dist.tolist(), every.efc_address.tolist()
-        counts: dict[tuple[int, int], int] = {}
+        last_numbers: dict[tuple[int, int], int] = {}
         for i, (first, second) in enumerate(every.geom.tolist()):
             for jacobian, geom in zip(jacobians, (first, second), strict=True):
-                mujoco.mj_jac(model, data, jacobian, None, places[i], self._bodies[geom])
+                mujoco.mj_jac(model, data, jacobian, None, points[i], self._bodies[geom])
             rows = 3 if dims[i] > 1 else 1
             relative = frames[i, :rows] @ (jacobians[1] - jacobians[0])
-            number = counts[first, second] = counts.get((first, second), -1) + 1
+            number = last_numbers[first, second] = last_numbers.get((first, second), -1) + 1
+            # A contact without a force has no constraint, and so the address -1.
             contacts[first, second, number] = relative, distances[i], addresses[i] >= 0
         return contacts
 
@@ -203,11 +206,16 @@ def settle_contacts(
 ) -> tuple[Array, Array]:
     """Return the likeliest first state of a run at which the contacts are in equilibrium.
 
-    A simulation that begins at the measured state would throw the robot up or let it fall, because
-    contacts are stiffer than a measurement is accurate. The result minimises the sum of squares (2)
-    of the module: deviations from the measured state, and motion of the contact points. Each
-    iteration linearises the contacts by finite differences, solves for a Gauss-Newton step, and
-    halves it until the sum decreases.
+    A simulation that begins at the measured state z_m would throw the robot up or let it fall,
+    because contacts are stiffer than a measurement is accurate. The result z minimises
+
+        |W (z - z_m)|^2 + |u_n / e_v|^2 + |(du/dt) / e_a|^2                                    (2)
+
+    with the velocity u of the contact points, its normal part u_n, and tolerances e. The steps are:
+
+    1. Select the contacts that may be closed: those whose distance could be a measurement error.
+    2. Linearise them by finite differences, and solve for a Gauss-Newton step.
+    3. Halve the step until the sum decreases, and repeat from 2 until it hardly does.
 
     Args:
         model: the robot.
@@ -217,9 +225,9 @@ def settle_contacts(
         weights: (2 D, 2 D) W of (2), invertible; None if the errors of the start are independent
             with the standard deviations `sigma`. The readings of a whole run determine a velocity
             better than two of them do.
-        known_jacobians: derivatives of nearly the same contacts, by their layout. They are used in
-            place of finite differences while the steps decrease the sum (chord method), and new
-            ones are added. By default, each iteration makes its own.
+        known_jacobians: derivatives of nearly the same contacts, by the contacts and whether each
+            is closed. They are used in place of finite differences while the steps decrease the sum
+            (chord method), and new ones are added. By default, each iteration makes its own.
 
     Returns:
         (D,) positions and velocities; the measured ones if no contact may be closed.
@@ -228,6 +236,7 @@ def settle_contacts(
     if weights is None:
         weights = np.diag(1.0 / np.concatenate(sigma))
     with capture_mujoco_warnings():
+        # 1. Contacts that may be closed.
         model.begin_run(scenario, *start)
         state, present = measured, model.evaluate(measured)
         keys = [
@@ -243,6 +252,7 @@ def settle_contacts(
             # The contacts are already in equilibrium.
             if cost <= SETTLED_COST * len(keys):
                 break
+            # 2. Gauss-Newton step.
             layout = tuple((key, present[key].is_closed) for key in keys)
             residual = _compute_residual(present, present, keys)
             # Without known derivatives, each iteration makes its own.
@@ -252,6 +262,7 @@ def settle_contacts(
                 reused[layout] = _differentiate(model, state, present, residual, keys)
             jacobian = reused[layout]
             step = _solve(jacobian, residual, weights @ (state - measured), weights)
+            # 3. Step length.
             for _ in range(MAX_HALVINGS):
                 contacts = model.evaluate(state + step)
                 offset = weights @ (state + step - measured)
@@ -262,6 +273,7 @@ def settle_contacts(
             else:  # No step decreases the cost.
                 if not is_known:
                     break
+                # The reused derivatives are not valid here, so the next iteration makes new ones.
                 del reused[layout]
                 continue
             has_converged = cost - new_cost < MIN_DECREASE * cost
@@ -281,12 +293,14 @@ def _differentiate(
 ) -> Array:
     """Return finite differences (m, 2 D) of the residual of contact equilibrium by the state.
 
+    The columns are the D positions, then the D velocities.
+
     Args:
         model: the robot.
         state: (2 D,) positions and velocities.
         present: contacts at this state.
         residual: (m,) residual at this state.
-        keys: contacts that count.
+        keys: contacts that may be closed, which make up the residual.
     """
     jacobian = np.empty((residual.size, state.size))
     for i, difference in enumerate(np.repeat(DIFFERENCES, state.size // 2).tolist()):
@@ -298,36 +312,37 @@ def _differentiate(
 
 
 def _solve(jacobian: Array, residual: Array, offset: Array, weights: Array) -> Array:
-    """Return the Gauss-Newton step (2 D,) that minimises the sum of squares (2), linearised.
+    """Return the Gauss-Newton step (2 D,) for the sum of squares |offset|^2 + |residual|^2.
 
-    It is a linear least-squares problem in the weighted change of the state, in which the distance
-    from the measured state has the unit matrix as its derivative.
+    It is a linear least-squares problem in the weighted step y = W dz: the offset becomes offset +
+    y, and the residual becomes residual + J W^-1 y with the Jacobian J.
 
     Args:
         jacobian: (m, 2 D) derivatives of the residual.
         residual: (m,) weighted residual of the contacts.
-        offset: (2 D,) W (z - z_m), the weighted distance from the measured state.
-        weights: (2 D, 2 D) W of (2).
+        offset: (2 D,) W (z - z_m), the weighted distance of the state z from the measured one.
+        weights: (2 D, 2 D) W, a square root of the inverse covariance of the measured state.
     """
-    by_offset = np.linalg.solve(weights.T, jacobian.T).T
-    rows = np.concatenate([np.eye(offset.size), by_offset])
-    change = np.linalg.lstsq(rows, -np.concatenate([offset, residual]), rcond=None)[0]
-    step: Array = np.linalg.solve(weights, change).astype(np.float64)
+    weighted_jacobian = np.linalg.solve(weights.T, jacobian.T).T  # J W^-1
+    rows = np.concatenate([np.eye(offset.size), weighted_jacobian])
+    weighted_step, *_ = np.linalg.lstsq(rows, -np.concatenate([offset, residual]), rcond=None)
+    step: Array = np.linalg.solve(weights, weighted_step).astype(np.float64)
     return step
 
 
 def _compute_residual(
     contacts: dict[_Key, _Contact], reference: dict[_Key, _Contact], keys: list[_Key]
 ) -> npt.NDArray[np.float64]:
-    """Return the residual of contact equilibrium (1), divided by its tolerances.
+    """Return the residual (m,) of contact equilibrium (1), divided by its tolerances.
 
     A closed contact must have no normal velocity and no acceleration of its point. An open one must
-    have no normal velocity and a small depth, so that it closes.
+    have no normal velocity and the depth `FIRST_DEPTH`, so that it closes.
 
     Args:
         contacts: contacts at the state; one that does not exist there is taken from `reference`.
-        reference: contacts at the state of the linearisation, which decide what is closed.
-        keys: contacts that count.
+        reference: contacts at the state of the linearisation, which decide what is closed, so that
+            the number of rows does not change with the state.
+        keys: contacts that may be closed, which make up the residual.
     """
     rows: list[Array] = []
     for key in keys:

@@ -30,7 +30,8 @@ SAMPLED_STEP_FRACTION = 0.5
 def compute_off_steps(robot: RobotModel, scenario: Scenario, step: float, steps: int) -> Mask:
     """Compute in which steps of a run each actuator is switched off.
 
-    The state is held from one sample of the recording to the next.
+    The on/off state is held from one sample of the recording to the next. A step has the state in
+    its middle.
 
     Args:
         robot: robot whose actuators are meant.
@@ -74,7 +75,8 @@ class ForceRanges:
     def write(self, off: Mask) -> None:
         """Switch actuators of the first n batch elements off where `off` (n, K) is true.
 
-        All their other actuators are switched on.
+        All their other actuators are switched on: they get the force ranges that they had when this
+        object was created.
         """
         limited, ranges = self._initial
         n = len(off)
@@ -87,24 +89,22 @@ class ForceRanges:
 
 
 def find_working_servos(robot: RobotModel, velocities: Any, off: Mask) -> Array:
-    """Return 0 for coordinates whose position servo is switched off, and 1 for all others.
+    """Return 0 for joints whose position servo is switched off, and 1 for all others.
 
     The caller multiplies the stiffness of servos by it.
 
-    Shapes: D joints.
-
     Args:
-        robot: robot whose actuators are meant.
-        velocities: (D,) addresses of the velocities of the coordinates in `qvel`.
+        robot: robot with K actuators.
+        velocities: (D,) addresses in `qvel` of the velocities of D joints.
         off: (..., K) whether each actuator is off.
 
     Returns:
         (..., D) zeros and ones.
     """
-    columns = {int(place): i for i, place in enumerate(velocities)}
-    result = np.ones((*off.shape[:-1], len(columns)))
+    column_of_address = {int(address): column for column, address in enumerate(velocities)}
+    is_working = np.ones((*off.shape[:-1], len(column_of_address)))
     for actuator in robot.actuators:
         if actuator.kind == "position" and actuator.joint is not None:
-            column = columns[robot.joint(actuator.joint).velocity]
-            result[..., column] = np.where(off[..., actuator.id], 0.0, result[..., column])
-    return result
+            column = column_of_address[robot.joint(actuator.joint).velocity]
+            is_working[..., column] *= ~off[..., actuator.id]
+    return is_working

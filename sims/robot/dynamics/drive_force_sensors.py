@@ -34,7 +34,7 @@ class DriveSensorModel:
     Attributes:
         robot: robot that is simulated.
         system: system of the robot.
-        batch: MuJoCo batch.
+        batch: MuJoCo batch, whose `drives` are the columns of the drive forces in its sensor data.
         given: inputs of the batch elements.
         step: step length in seconds.
     """
@@ -46,14 +46,15 @@ class DriveSensorModel:
     step: float
 
     def shift_to_step_begin(self, readings: Array) -> None:
-        """Shift readings (n, S, k) from the mean command of a step to its initial command.
+        """Correct drive-force readings for commands that change within a step.
 
         MuJoCo applies the mean of a command over a step, but a sensor of the drive force shows the
         force at the beginning. The difference of the two commands times the actuator's force per
         unit of command is added, within its force limits. If a drive is coupled to the preceding
-        joint, that reading changes too. The readings are changed in place.
+        joint, the reading of that joint changes in proportion.
 
-        Shapes: S steps.
+        Args:
+            readings: (n, S, k) sensor data of n batch elements in S steps; changed in place.
         """
         given, mujoco_batch = self.given, self.batch
         batch_size = len(readings)
@@ -62,12 +63,13 @@ class DriveSensorModel:
                 given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
             )
             control_change = np.where(given.off[:, :, actuator.id], 0.0, control_change)
+            # Without a driven joint no sensor shows the force.
             if actuator.joint not in mujoco_batch.drives or not control_change.any():
                 continue
-            column = readings[:, :, mujoco_batch.drives[actuator.joint]]
-            unshifted = column.copy()
-            column += control_change * self._compute_force_per_control(actuator)[:batch_size, None]
-            np.clip(column, *self._get_force_limits(actuator), out=column)
+            force = readings[:, :, mujoco_batch.drives[actuator.joint]]  # a view
+            force_before = force.copy()
+            force += control_change * self._compute_force_per_control(actuator)[:batch_size, None]
+            np.clip(force, *self._get_force_limits(actuator), out=force)
             if actuator.joint in mujoco_batch.robot.coupled:
                 preceding_joint = find_preceding_joint(self.robot, actuator.joint)
                 assert preceding_joint is not None
@@ -76,22 +78,23 @@ class DriveSensorModel:
                 ]
                 readings[:, :, mujoco_batch.drives[preceding_joint.name]] += coupling_coefficients[
                     :, None
-                ] * (column - unshifted)
+                ] * (force - force_before)
 
     def add_drive_effects(self, readings: Array, x: Array, v: Array, acting: ActiveEffects) -> None:
-        """Add the forces of effects in the drives, such as a dead zone or a voltage drop.
+        """Add the forces of effects in the drives to the drive-force readings.
 
-        The simulation applies these effects as external forces, so MuJoCo's sensors do not contain
-        them.
-
-        Shapes: S steps, D joints.
+        Examples are a dead zone and a voltage drop. The simulation applies these effects as
+        external forces, so MuJoCo's sensors do not contain them. They are evaluated at the
+        beginnings of all steps at once: each pair of a batch element and a step is one element of a
+        snapshot.
 
         Args:
-            readings: (n, S, k) sensor readings; changed in place.
-            x: (n, S + 1, D) positions.
+            readings: (n, S, k) sensor data of n batch elements in S steps; changed in place.
+            x: (n, S + 1, D) positions of the D joints.
             v: (n, S + 1, D) velocities.
-            acting: active effects with their coefficients.
+            acting: active effects with their coefficients (K, n, 1).
         """
+        # 1. Batch elements with such an effect, and their readings of all drives.
         batch_indices = np.flatnonzero(find_active_elements(acting, len(x), is_in_drive))
         if not batch_indices.size:
             return
@@ -99,8 +102,9 @@ class DriveSensorModel:
         columns = [mujoco_batch.drives[name.removeprefix("q.")] for name in self.system.coordinates]
         drive_readings = readings[batch_indices][:, :, columns]
 
+        # 2. Snapshot of all steps.
         def flatten(values: Array) -> Array:
-            """Stack all sample times of the selected batch elements into one axis."""
+            """Stack all steps of the selected batch elements into one axis."""
             return values[batch_indices, :steps].reshape(batch_indices.size * steps, -1)
 
         inputs = {name: flatten(u) for name, u in given.applied_inputs.items()}
@@ -110,6 +114,7 @@ class DriveSensorModel:
                 inputs[f"u.{actuator.name}"] = flatten(given.instant[:, :, actuator.control])
         t = np.tile(self.step * np.arange(float(steps)), batch_indices.size)[:, None]
         drive = drive_readings.reshape(batch_indices.size * steps, -1)
+        # The load on the other side of the transmissions does not matter to effects in drives.
         carried = np.stack([drive, np.zeros_like(drive)])
         stiffness = np.repeat(
             mujoco_batch.get_servo_stiffness(mujoco_batch.file_joints)[batch_indices], steps, axis=0
@@ -122,6 +127,7 @@ class DriveSensorModel:
             )
             stiffness = stiffness * is_servo_on.reshape(stiffness.shape)
         snapshot = make_snapshot(self.system, t, flatten(x), flatten(v), inputs, carried, stiffness)
+        # 3. Forces of the effects.
         selected = slice_active_effects(
             tuple((e, c) for e, c in acting if is_in_drive(e)), batch_indices
         )
@@ -132,7 +138,11 @@ class DriveSensorModel:
         readings[batch_indices[:, None, None], np.arange(steps)[:, None], columns] = drive_readings
 
     def _compute_force_per_control(self, actuator: Actuator) -> Array:
-        """Return the immediate joint force per unit of an actuator's control, (N,)."""
+        """Return the joint force at once per unit of an actuator's control, (N,) in the batch.
+
+        It is zero if a filter precedes the actuator, or if the force is not a gain times the
+        control.
+        """
         gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
         gain: Array = self.batch.fields["actuator_gainprm"][:, actuator.id, 0]
         direct = actuator.kind in ("motor", "position", "velocity")

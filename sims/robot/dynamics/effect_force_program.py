@@ -80,16 +80,18 @@ class StepForces:
     ) -> None:
         """Find or make the program of the effects, and write the values that stay constant.
 
-        Also note in which batch elements an effect adds dry friction or depends on the loads of
-        transmissions, because these need additional work in each step.
-
-        Shapes: L batch elements, D joints, S steps.
+        1. Note in which batch elements an effect adds dry friction or depends on the loads of
+           transmissions, because these need additional work in each step.
+        2. Find a compiled program of these effects in the system's cache, or make one. Effects that
+           cannot be compiled are evaluated by NumPy.
+        3. Divide the registers of the program into groups, in the order of the inputs of
+           `_make_function`, and write those that do not change from step to step.
 
         Args:
             system: system of the robot.
             acting: effects at one place each.
-            applied_inputs: applied inputs (L, S) by name.
-            addresses: addresses of the joints.
+            applied_inputs: applied inputs (L, S) by name, of L batch elements over S steps.
+            addresses: addresses of the D joints.
             stiffness: (L, D) stiffness of the position servos.
             step: step length in seconds.
             working: (L, S, D) 0 where a position servo is switched off and 1 elsewhere; None if all
@@ -99,6 +101,7 @@ class StepForces:
         self.depends_on_switches = working is not None
         self._system, self._applied_inputs = system, applied_inputs
         self._stiffness, self._working = stiffness, working
+        # 1. Dry friction and loads.
         effects = StepEffects.from_active(acting)
         self._hidden = effects.hidden
         self.has_dry_friction: Mask = np.zeros(stiffness.shape, dtype=bool)
@@ -108,6 +111,7 @@ class StepForces:
         for loading, c in acting:
             if loading.of in LOAD_DEPENDENT_EFFECTS:
                 self.loaded |= (c != 0).any(axis=0)[:, 0]
+        # 2. Program.
         inputs = tuple(applied_inputs)
         function = _make_function(system, inputs, effects)
         programs: TracedPrograms = system.traced.setdefault(inputs, TracedPrograms())
@@ -117,11 +121,12 @@ class StepForces:
             for effect, c in group
         ]
         program = programs.find(function, sources) or make_numpy_program(function)
+        # 3. Registers.
         self.prepared = PreparedProgram(program, len(stiffness))
         self.registers = r = self.prepared.r
         groups = [slice(*ends) for ends in pairwise(function.input_ends)]
-        self._t, self._midpoint_time, step_group, self._interval, *self._motion = groups[:-4]
-        self._u, self._stiffness_group, coefficient_group, self._states = groups[-4:]
+        self._t, self._midpoint_time, step_group, self._interval, *groups = groups
+        *self._motion, self._u, self._stiffness_group, coefficient_group, self._states = groups
         r[step_group] = step
         r[self._stiffness_group] = stiffness.T
         r[coefficient_group] = effects.coefficients
@@ -129,10 +134,10 @@ class StepForces:
         prepare_elements()
 
     def _make_test(self, effect: Effect, c: Array) -> tuple[ArrayFunction, Iterator[Array]]:
-        """Return the array function of one effect, and random inputs; see `TracedSource`.
+        """Return the array function of one effect, and random inputs at which to test its program.
 
-        The random numbers have different sizes and a fixed seed, so that the answer is the same in
-        each process.
+        A compiled program must agree with NumPy there (`TracedSource`). The random numbers have
+        different sizes and a fixed seed, so that the answer is the same in each process.
 
         Args:
             effect: effect in the batch.
@@ -148,10 +153,12 @@ class StepForces:
             shape = function.input_ends[-1], len(self._stiffness)
             for number in range(TESTED_STATES):
                 sample = rng.normal(size=shape) * rng.choice(TEST_STATE_SIZES)
+                # Time at the beginning and in the middle, step length, and interval, in steps.
                 for group, steps in zip(groups, (number, number + 0.5, 1.0, 1.0), strict=False):
                     sample[group] = steps * self.step
-                sample[groups[-3]] = self._stiffness.T
-                sample[groups[-2]] = effects.coefficients
+                *_, stiffness_group, coefficient_group, _ = groups
+                sample[stiffness_group] = self._stiffness.T
+                sample[coefficient_group] = effects.coefficients
                 yield sample
 
         return function, make_samples()
@@ -172,7 +179,11 @@ class StepForces:
         return CallbackLayout(*(group.start for group in groups))
 
     def begin(self, joint_states: JointStates) -> None:
-        """Set the hidden states at the beginning of a motion."""
+        """Set the hidden states of effects at the beginning of a motion, in the registers.
+
+        Args:
+            joint_states: joint states at the beginning of the first step.
+        """
         if not self._hidden:
             return
         inputs = {name: u[:, 0, None] for name, u in self._applied_inputs.items()}
@@ -186,6 +197,7 @@ class StepForces:
             self.registers[self._stiffness_group].T,
         )
         states = [effect.begin(c, snapshot) for effect, c in self._hidden]
+        # A hidden state has a position x and a rate v, (L, 1) each.
         parts = [part for state in states for part in (state.x, state.v)]
         self.registers[self._states] = np.concatenate(parts, axis=1).T
 
@@ -193,9 +205,8 @@ class StepForces:
         """Compute forces and dry friction limits (L, D) at the middle of step k, in N or N m.
 
         MuJoCo holds forces over a step. Evaluated at the predicted middle, they have an error of
-        second order only. Hidden states of effects advance to the same time.
-
-        Shapes: L batch elements, D joints.
+        second order only. Hidden states of effects advance to the same time. All L batch elements
+        and D joints are evaluated at once.
 
         Args:
             k: number of the step; must increase by one from call to call.
@@ -206,6 +217,7 @@ class StepForces:
             registers[rows] = values.T
         registers[self._t] = k * self.step
         registers[self._midpoint_time] = (k + 0.5) * self.step
+        # Without inputs there is one row, which holds for all steps.
         registers[self._u] = self.input_values[min(k, len(self.input_values) - 1)]
         # Hidden states advance from the middle of the previous step to the middle of this one.
         registers[self._interval] = self.step if k else 0.5 * self.step
@@ -222,12 +234,18 @@ class StepForces:
 def _make_function(
     system: RobotSystem, input_names: Sequence[str], effects: StepEffects
 ) -> ArrayFunction:
-    """Return the array function of effects on a robot.
+    """Return the array function that evaluates effects on a robot in one step.
 
-    The groups of inputs are time at the beginning and at the middle of a step, step length,
-    interval over which hidden states advance, motion (`JointStates`), inputs, stiffness of servos,
-    coefficients, and hidden states. The outputs are the forces, the limits of dry friction, and the
-    hidden states after the interval; of each state the position and the rate.
+    Its inputs are these groups of registers, with one column for each batch element:
+
+    * time at the beginning and at the middle of the step, step length, and interval over which
+      hidden states advance (1 each),
+    * the motion, which is the fields of `JointStates` (D joints each),
+    * inputs of the robot, stiffness of servos (D), coefficients of the effects, and hidden states
+      (position and rate of each).
+
+    Its outputs are the forces (D), the limits of dry friction (D), and the hidden states after the
+    interval.
 
     Args:
         system: system of the robot.
@@ -251,6 +269,8 @@ def _make_function(
             )
             force = compute_effect_forces(acting.forces, midpoint)
             later_states = np.zeros((1, 0))
+            # Hidden states advance with the state at the beginning of the step, and act at its
+            # middle.
             if acting.hidden:
                 loads = np.stack(at.transmission_loads)
                 start = make_snapshot(system, t, at.x, at.v, inputs, loads, stiffness)

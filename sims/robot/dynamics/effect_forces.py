@@ -23,12 +23,7 @@ def make_snapshot(
     carried: Array,
     stiffness: Array | None = None,
 ) -> RobotSnapshot:
-    """Make a snapshot of batch elements, the state at which effects are evaluated.
-
-    The system of a robot has neither parameters nor constants: all its numbers are in MuJoCo's
-    model.
-
-    Shapes: L batch elements, D joints.
+    """Make a snapshot: the state of L batch elements with D joints at which effects are evaluated.
 
     Args:
         system: system of the robot.
@@ -39,22 +34,30 @@ def make_snapshot(
         carried: (2, L, D) forces on both sides of the transmissions.
         stiffness: (L, D) stiffness of position servos; no servo is active if None.
     """
-    theta = np.zeros((len(x), 0))
-    stiff = np.zeros((0, 0)) if stiffness is None else stiffness
-    drives, servos = dict(system.drives), dict(system.servos)
-    joints = system.alone, drives, servos, stiff
-    return RobotSnapshot(system, theta, {}, t, x, v, inputs, carried, *joints)
+    return RobotSnapshot(
+        system,
+        # The system has neither parameters nor constants: all numbers are in MuJoCo's model.
+        np.zeros((len(x), 0)),
+        {},
+        t,
+        x,
+        v,
+        inputs,
+        carried,
+        system.alone,
+        dict(system.drives),
+        dict(system.servos),
+        np.zeros((0, 0)) if stiffness is None else stiffness,
+    )
 
 
 def compute_time_dependent_forces(
     system: RobotSystem, acting: ActiveEffects, t: Array, size: int, batch_size: int
 ) -> Array:
-    """Compute the forces (L, S, D) of effects that depend on time alone.
+    """Compute the forces (L, S, D) of effects that depend on time alone, for L batch elements.
 
-    They are known before the simulation and applied as generalised forces, so that the batch
-    needs no evaluation of effects in each step.
-
-    Shapes: S steps, K coefficients.
+    They are known before the simulation and applied as generalised forces on the D joints in S
+    steps, so that the batch needs no evaluation of effects in each step.
 
     Args:
         system: system of the robot.
@@ -65,6 +68,7 @@ def compute_time_dependent_forces(
     """
     forces = np.zeros((batch_size, t.size, size))
     half = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
+    # The state does not matter; each step is one element of the snapshot.
     at_rest = np.zeros((t.size, size))
     # The force at the middle of a step gives the momentum of the force over the step, to second
     # order.
@@ -81,9 +85,9 @@ def compute_time_dependent_forces(
 
 
 def compute_drive_effect_forces(acting: ActiveEffects, snapshot: RobotSnapshot) -> Array:
-    """Compute the forces (L, D) that effects in drives add to the drives.
+    """Compute the forces (L, D) that effects in drives, such as a voltage drop, add to the drives.
 
-    Shapes: L batch elements, D joints, K coefficients.
+    Effects that act elsewhere are ignored. Shapes: L batch elements, D joints, K coefficients.
 
     Args:
         acting: effects with their coefficients (K, L, 1).
@@ -138,25 +142,27 @@ def compute_hidden_state_forces(
 ) -> tuple[Array, list[HiddenState]]:
     """Advance hidden states of effects, and compute their forces afterwards.
 
-    A hidden state is a variable that an effect has beyond the joints, such as the deflection of
-    bristles in a friction model. An effect whose first coefficient is zero exerts no force.
+    A hidden state is a variable that an effect has in addition to the state of the robot, such as
+    the deflection of bristles in a friction model. In batch elements in which the first coefficient
+    of an effect is not above zero, it exerts no force.
 
-    Shapes: L batch elements, D joints.
+    Shapes: L batch elements, D joints, K coefficients.
 
     Args:
-        hidden: effects with their coefficients.
-        snapshots: snapshots at the middle and at the end of the interval.
-        states: hidden states at the beginning.
+        hidden: effects with their coefficients (K, L, 1).
+        snapshots: snapshots during the interval, with which the states advance; and at its end, at
+            which the forces are evaluated.
+        states: hidden states of the effects at the beginning.
         step: length of the interval in seconds.
 
     Returns:
         Total force (L, D) and hidden states at the end of the interval.
     """
-    midpoint, end = snapshots
+    during, end = snapshots
     total = np.zeros_like(end.x)
     later_states = []
     for (effect, c), state in zip(hidden, states, strict=True):
-        after = advance_state(effect, c, midpoint, state, step)
+        after = advance_state(effect, c, during, state, step)
         force, _ = effect.act(c, end, after)
         total = total + np.where(c[0] > 0, force, 0.0)
         later_states.append(after)

@@ -38,7 +38,7 @@ def advance_state(
 
     With the rate r(w) and the step h, w changes by h phi(z) r, z = h dr/dw and
     phi(z) = (e^z - 1) / z, which is exact if the rate is linear in w. The derivative dr/dw is a
-    difference quotient.
+    difference quotient. In `HiddenState`, w is the velocity v; the position x is its integral.
 
     Shapes: L batch elements, K coefficients.
 
@@ -56,6 +56,7 @@ def advance_state(
     _, perturbed_rate = effect.act(c, snapshot, HiddenState(state.x, state.v + STATE_STEP))
     z = step * (perturbed_rate - rate) / STATE_STEP
     is_small = np.abs(z) < MIN_EXPONENT
+    # For small z, the first two terms of the series.
     phi = np.where(is_small, 1.0 + 0.5 * z, np.expm1(z) / np.where(is_small, 1.0, z))
     v = state.v + step * phi * rate  # (1)
     return HiddenState(state.x + 0.5 * step * (state.v + v), v)
@@ -66,14 +67,15 @@ def integrate_state(
 ) -> HiddenState:
     """Integrate the hidden state of an effect along a known motion.
 
-    The motion is not changed by the effect, as in a linearisation. If the state's rate is a linear
-    function of it at all times, which is tested at three points, a fast recursion is used.
-    Otherwise the state advances step by step.
+    The effect does not change the motion. If the rate of the state is a linear function of the
+    state at all times, which is tested with three values of it, a fast recursion is used. Otherwise
+    the state advances step by step.
 
     Args:
         effect: effect at its place.
         c: (K, 1, 1) coefficients of the effect.
-        snapshots: system states at the middle of each of the S steps, stored as S batch elements.
+        snapshots: states of the robot at the middle of each of the S steps, stored as S batch
+            elements.
         step: step length in seconds.
 
     Returns:
@@ -85,6 +87,7 @@ def integrate_state(
     zero = np.zeros((steps, 1))
 
     def rate(w: float, x: float) -> Array:
+        """Return the rate (S, 1) of the state at velocity w and position x, in all steps."""
         return effect.act(coefficients, snapshots, HiddenState(zero + x, zero + w))[1]
 
     rate_at_zero, rate_at_one, rate_at_half = rate(0.0, 0.0), rate(1.0, 0.0), rate(0.5, 1.0)
@@ -101,15 +104,14 @@ def integrate_state(
 
 
 def _integrate_linear_state(state: HiddenState, change_at_zero: Array, z: Array) -> HiddenState:
-    """Integrate a hidden state whose rate is linear in the state throughout the motion.
+    """Integrate a hidden state w whose rate r(w) = r(0) + w dr/dw is linear in each step.
 
-    The step is w + h phi(z) r(w), phi(z) = (e^z - 1) / z, z = h dr/dw (1).
-
-    Shapes: S steps.
+    The step w + h phi(z) r(w), with phi(z) = (e^z - 1) / z and z = h dr/dw (1), is then the
+    recursion w <- e^z w + phi(z) h r(0). The position of the state stays constant.
 
     Args:
         state: initial state, (1, 1).
-        change_at_zero: (S, 1) h r(0) of each step, with r and h as in (1).
+        change_at_zero: (S, 1) h r(0) of each of S steps of length h.
         z: (S, 1) h dr/dw of each step.
 
     Returns:

@@ -33,9 +33,8 @@ def motion_forces(
 ) -> MotionForces:
     """Compute the joint forces of a motion by inverse dynamics, and those of the actuators.
 
-    The difference of both is what the model lacks. The motion is given, so nothing is integrated.
-
-    Joints that are not in `joints` rest in the reference pose of the model.
+    The difference of both is the force that the model lacks. The motion is given, so nothing is
+    integrated. Joints that are not in `joints` rest in the reference pose of the model.
 
     Args:
         model: compiled mujoco.MjModel.
@@ -55,15 +54,15 @@ def motion_forces(
     positions = np.array([joint.position for joint in joints], dtype=np.intp)
     dofs = np.array([joint.velocity for joint in joints], dtype=np.intp)
     needed, driven = np.zeros(motion.shape[1:]), np.zeros(motion.shape[1:])
-    for step_index in range(motion.shape[1]):
-        qpos[positions], qvel[dofs], qacc[dofs] = motion[:, step_index]
+    for sample in range(motion.shape[1]):
+        qpos[positions], qvel[dofs], qacc[dofs] = motion[:, sample]
         mujoco.mj_inverse(model, data)
-        needed[step_index] = inverse_forces[dofs]
-        ctrl[:] = controls[step_index]
+        needed[sample] = inverse_forces[dofs]
+        ctrl[:] = controls[sample]
         if activations is not None:
-            act[:] = activations[step_index]
+            act[:] = activations[sample]
         mujoco.mj_fwdActuation(model, data)
-        driven[step_index] = actuator_forces[dofs]
+        driven[sample] = actuator_forces[dofs]
     return MotionForces(needed, driven)
 
 

@@ -28,6 +28,8 @@ TYPICAL_ACCELERATION = 5.0
 
 MIN_FORCE = 1e-4
 """Minimum typical force of a joint, in N or N m."""
+MIN_INERTIA = 1e-9
+"""Minimum typical inertia of a joint, in kg or kg m^2."""
 
 
 MIN_PARENT_SHARE = 0.01
@@ -55,8 +57,11 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
     """Compute typical forces and inertias of the joints, from random poses within their ranges.
 
     They set the sizes of finite differences and of coefficients. The force is the larger of the
-    largest gravity force and the force for a typical acceleration; the inertia is a mean. The poses
+    largest gravity force, and the force for a typical acceleration with the mean inertia. The poses
     are the same in each call.
+
+    Returns:
+        Forces and inertias of the D joints with one coordinate, in the order of the robot's joints.
     """
     import mujoco
 
@@ -65,7 +70,7 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     dofs = [joint.velocity for joint in joints]
     rng = np.random.default_rng(7)
-    weights, inertias = [], []
+    gravity_forces, inertias = [], []
     mass_matrix = np.zeros((model.nv, model.nv))
     for _ in range(POSE_COUNT):
         data.qpos[:] = model.qpos0
@@ -76,26 +81,27 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
             data.qpos[joint.position] = rng.uniform(low, high)
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, mass_matrix)
-        weights.append(np.abs(data.qfrc_bias[dofs]))
+        # The joints rest, so bias forces are those of gravity.
+        gravity_forces.append(np.abs(data.qfrc_bias[dofs]))
         inertias.append(np.diagonal(mass_matrix)[dofs])
     inertia = np.mean(inertias, axis=0)
-    force = np.maximum(np.max(weights, axis=0), TYPICAL_ACCELERATION * inertia)
-    return JointScales(np.maximum(force, MIN_FORCE), np.maximum(inertia, 1e-9))
+    force = np.maximum(np.max(gravity_forces, axis=0), TYPICAL_ACCELERATION * inertia)
+    return JointScales(np.maximum(force, MIN_FORCE), np.maximum(inertia, MIN_INERTIA))
 
 
 def coefficient_scales(robot: RobotModel) -> JointScales:
     """Compute the forces and inertias of each joint (D,) that set the ranges of coefficients.
 
     The values are those of `compute_joint_scales`, but at least `MIN_PARENT_SHARE` times those of
-    the parent joint of the same kind: the next hinge or slide towards the base. So a link whose
-    inertia the file omits (1e-9 kg m^2) does not make the ranges of its joint vanish.
-
-    Shapes: D joints.
+    the parent joint of the same kind: for a hinge, the next hinge towards the base, for a slide the
+    next slide. So a link whose inertia the file omits (1e-9 kg m^2) does not make the ranges of its
+    joint vanish.
     """
     joint_scales = compute_joint_scales(robot)
     force, inertia = joint_scales.force.copy(), joint_scales.inertia.copy()
     model = robot.compiled
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
+    # Index of the last joint so far by body and kind.
     last_joint_of_body: dict[tuple[int, str], int] = {}
     # Bodies are numbered from the base outwards, so a parent joint has its final value already.
     for joint_index, joint in enumerate(joints):

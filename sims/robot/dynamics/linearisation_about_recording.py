@@ -121,19 +121,17 @@ class MeasuredLinear(RunLinearisation):
 
         The derivatives of a step (Jacobians) are computed by differences, and held for one sample
         interval, but not for less than `LINEARISATION_INTERVAL_SECONDS` or more than
-        `MAX_JACOBIAN_SECONDS`. `knots` (T,) are the numbers of the steps at the samples. With
-        `nearby`, a model of a similar motion, most of this work is saved.
-
-        Shapes: T samples, D joints.
+        `MAX_JACOBIAN_SECONDS`. With `nearby`, a model of a similar motion, most of this work is
+        saved.
 
         Args:
             simulator: simulator of the robot.
             theta: (dim,) parameters.
             scenario: scenario of the run.
             start: (D,) positions and velocities at which the simulated motion begins.
-            trajectory: given motion.
+            trajectory: given motion at all steps.
             measured: alternative to `trajectory`: (T, 3) position, velocity and acceleration at the
-                samples, by joint number; all other joints follow the simulation.
+                T samples, by joint number; all other joints follow the simulation.
             nearby: linear model of a similar motion, whose commands and readings are reused.
             reuses_jacobians: whether its Jacobians are reused as well.
             reuses_loads: whether the loads of its transmissions are reused as well, unless an
@@ -149,10 +147,11 @@ class MeasuredLinear(RunLinearisation):
         if self._sensor_channels:
             # The readings belong to the given motion, not to the simulated one.
             with np.errstate(all="ignore"), capture_mujoco_warnings():
-                read = self._tangent.motion_readings
-            self._readings = {name: read[:, i] for i, name in enumerate(self._sensor_channels)}
+                readings = self._tangent.motion_readings
+            self._readings = dict(zip(self._sensor_channels, readings.T, strict=True))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             self.observed = self._observe_nominal_motion()
+        # Numbers (T,) of the steps at whose beginnings the samples are.
         knots = np.rint(self._times / self._simulator.time_step).astype(np.intp)
         self.knots: IndexArray = np.clip(knots, 0, self._steps)
 
@@ -175,9 +174,10 @@ class MeasuredLinear(RunLinearisation):
         """Return the given motion with the commands of the run, in place of a simulated motion.
 
         The base class linearises about a simulated motion; this overrides it. Only positions and
-        velocities of the robot's joints and its floating base are given. All else comes from a
-        simulation or from the motion of `nearby`: commands, activations, and joints in series (the
-        second joints of flexible drives).
+        velocities of the robot's joints and its floating base are given. Activations, and joints in
+        series (the second joints of flexible drives), are those of a simulation. Loads of the
+        transmissions are computed for the given motion, unless they are reused and no active effect
+        depends on them.
         """
         motion = self._get_nearby_motion() or super()._simulate_nominal_motion()
         trajectory = self._trajectory or self._interpolate_samples(motion)
@@ -194,10 +194,11 @@ class MeasuredLinear(RunLinearisation):
         )
 
     def _get_nearby_motion(self) -> RobotMotion | None:
-        """Return the motion of `nearby` with the commands of this model, which saves a simulation.
+        """Return the motion of the model `nearby` with the commands of this model.
 
-        The result is None if there is no such motion, or if the robot has more states than the
-        positions and velocities of its joints: these are given, all others must be simulated.
+        It saves a simulation. The result is None if there is no such model, or if the robot has
+        states other than the positions and velocities of the file's joints: only these are given,
+        all others must be simulated.
         """
         if self._nearby is None or self._trajectory is None:
             return None
@@ -221,18 +222,19 @@ class MeasuredLinear(RunLinearisation):
         """Interpolate the measured joints between samples by quintic Hermite polynomials.
 
         Args:
-            motion: Simulated motion, whose measured joints are replaced by the measurement.
+            motion: simulated motion, which all other joints and the floating base keep.
 
         Returns:
-            Positions and velocities at the steps of the simulation.
+            The motion of the file's joints at the steps of the simulation.
         """
         # Joints that are not recorded may diverge in the simulation.
         x, v = (
-            np.clip(np.nan_to_num(u), -MAX_DEVIATION, MAX_DEVIATION) for u in (motion.x, motion.v)
+            np.clip(np.nan_to_num(states), -MAX_DEVIATION, MAX_DEVIATION)
+            for states in (motion.x, motion.v)
         )
-        steps: Array = self._simulator.time_step * np.arange(float(len(x)))
+        step_times: Array = self._simulator.time_step * np.arange(float(len(x)))
         for joint, samples in self._measured.items():
-            x[:, joint], v[:, joint] = interpolate_quintic(self._times, samples, steps)
+            x[:, joint], v[:, joint] = interpolate_quintic(self._times, samples, step_times)
         joints = len(self._simulator.addresses.positions)
         return Trajectory(x[:, :joints], v[:, :joints], motion.floating_state)
 
@@ -241,17 +243,20 @@ class MeasuredLinear(RunLinearisation):
     def interval_maps(self) -> IntervalMaps:
         """Return the linear model from sample to sample that a Kalman smoother needs.
 
-        Let delta be the deviation of the true state from the given motion, and f a force that the
-        model lacks. Between samples i and i + 1, delta[i+1] = A_i delta[i] - d_i + G_i f_i (3), and
-        the readings are y[i] = h + H_i delta[i] (4). A_i is the product of the derivatives of all
-        steps in the interval; the force and the defect d (the difference between the motion and the
-        model's own step) are composed in the same way. H is computed by finite differences.
+        Let δ be the deviation of the true state from the given motion, and f a force that the model
+        lacks. Between samples i and i + 1, δ[i+1] = A_i δ[i] - d_i + G_i f_i (3), and the readings
+        are y[i] = h + H_i δ[i] (4). A_i is the product of the derivatives of all steps in the
+        interval; the responses G_i and the defects d_i (the difference between the motion and the
+        model's own steps) are composed in the same way. H is computed by finite differences: each
+        state component is changed at all samples at once.
         """
         tangent, state_size = self._tangent, self._tangent.state_size
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             defects = self._compose(self._tangent.defects)
+        # Responses to the state at the beginning of an interval, without changes in its steps.
         points, quotients = tangent.point_of_step, tangent.quotients
         no_changes = np.broadcast_to(0.0, (points.size, state_size, state_size))
+        # Readings at changed states: one motion for each state component, changed in all steps.
         count = self._motion.x.shape[0]
         unit_changes = np.broadcast_to(
             STATE_DIFFERENCE * np.eye(state_size)[:, None, :], (state_size, count, state_size)
@@ -278,12 +283,12 @@ class MeasuredLinear(RunLinearisation):
     def compute_changes(self, similar: MeasuredLinear) -> tuple[Array, Array]:
         """Compute how defects and readings differ from those of a model with other parameters.
 
-        Both models have the same motion and Jacobians.
-
-        Shapes: T samples, C channels.
+        Args:
+            similar: model of the same motion with the same Jacobians.
 
         Returns:
-            Changes of d in (3), (T - 1, Z), and of h(x̄) in (4), (T, C).
+            Changes of the defects d in (3), (T - 1, Z), and of the readings h(x̄) of the motion in
+            (4), (T, C), at T samples of C channels.
         """
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             changes = self._tangent.compute_defect_changes(similar._tangent)
@@ -294,8 +299,11 @@ class MeasuredLinear(RunLinearisation):
     ) -> Array:
         """Compose state changes in each step to those of each interval between samples.
 
+        A change z in an interval becomes A z + (change in this step) in each step, with the
+        derivatives A of the step by the state.
+
         Args:
-            values: (S, Z) or (S, Z, m) state changes in each step.
+            values: (S, Z) or (S, Z, m) changes in each step of m kinds, such as unit forces.
             initial: (Z, m) changes of the state at the beginnings of the intervals; none by
                 default.
             rows: (S,) row of `values` for each step, if they are not in the order of the steps.
@@ -305,18 +313,19 @@ class MeasuredLinear(RunLinearisation):
         """
         columns = values[:, :, None] if values.ndim == 2 else values
         result = np.full((self.knots.size - 1, *columns.shape[1:]), initial)
-        points, states = self._tangent.point_of_step, self._tangent.quotients.states
+        points, derivatives = self._tangent.point_of_step, self._tangent.quotients.states
         # The first step of all intervals at once, then the second, and so on.
-        for steps, active in self._list_active_intervals():
+        for steps, intervals in self._list_active_intervals():
             changes = columns[steps if rows is None else rows[steps]]
-            result[active] = states[points[steps]] @ result[active] + changes
+            result[intervals] = derivatives[points[steps]] @ result[intervals] + changes
         return result.reshape(-1, *values.shape[1:])
 
     def _compute_limit_jumps(self) -> Array:
-        """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos.
+        """Return the standard deviations (T - 1, Z) of state jumps at force limits of stiff servos.
 
-        A servo at its force limit follows the linearised model no longer; the jump is added to the
-        process noise of a filter. Z is the size of the state, positions and velocities.
+        A servo at its force limit does not follow the linearised model: positions jump by known
+        sizes in each step in which the limit is reached. The sum of these jumps in an interval
+        between samples is added to the process noise of a filter.
         """
         mujoco_batch = self._simulator.make_linearisation_batch(self._work.acting)
         limits = mujoco_batch.force_limits
@@ -326,9 +335,10 @@ class MeasuredLinear(RunLinearisation):
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             reached = np.abs(self._tangent.limited_forces) >= limits.sizes
         jumps = limits.jumps[:, mujoco_batch.file_joints.velocities]
-        for steps, active in self._list_active_intervals():
-            state_changes[active, : jumps.shape[1]] += reached[steps] @ jumps
-        # A position servo returns from a jump of position within the interval or later.
+        for steps, intervals in self._list_active_intervals():
+            state_changes[intervals, : jumps.shape[1]] += reached[steps] @ jumps
+        # A position servo returns from a jump of position within the interval or later, so the
+        # velocity changes by the jump per length of the interval.
         lengths = np.maximum(np.diff(self.knots), 1)[:, None] * self._simulator.time_step
         position_count = self.positions
         state_changes[:, position_count : 2 * position_count] = (
@@ -338,7 +348,10 @@ class MeasuredLinear(RunLinearisation):
 
     @cached_property
     def step_errors(self) -> Array:
-        """Discretisation errors (T - 1, Z) of each interval; zero for the Runge-Kutta method."""
+        """Discretisation errors (T - 1, Z) of each interval between samples.
+
+        They are zero for the Runge-Kutta method, whose order is high.
+        """
         simulator, tangent = self._simulator, self._tangent
         if forces_are_at_step_end(simulator.make_linearisation_batch(self._work.acting).model):
             return np.zeros((self.knots.size - 1, tangent.state_size))
@@ -357,10 +370,11 @@ class MeasuredLinear(RunLinearisation):
             run, and the numbers (k,) of the intervals that are long enough to have it.
         """
         lengths = np.diff(self.knots)
+        first_steps = self.knots[:-1]
         result = []
         for number in range(int(lengths.max(initial=0))):
-            active = np.flatnonzero(lengths > number)
-            result.append((self.knots[:-1][active] + number, active))
+            intervals = np.flatnonzero(lengths > number)
+            result.append((first_steps[intervals] + number, intervals))
         return result
 
     def added(
@@ -375,17 +389,17 @@ class MeasuredLinear(RunLinearisation):
         applied to predicted readings: a gain applied to the recorded reading would contain the
         noise that it has to explain.
 
-        Shapes: T samples, C channels.
-
         Args:
             effects: K effects with their coefficients; those in series with a joint add nothing.
-            predicted: δ (T, Z) at the samples, each predicted from the preceding samples.
-            driven: changes of the controls by effects on inputs, by number of the effect; computed
+            predicted: (T, Z) deviations δ at the T samples, each predicted from the preceding
+                samples.
+            driven: changes of the controls by effects on inputs, by index of the effect; computed
                 if None.
 
         Returns:
-            Mean forces and controls (T - 1, E + nu, K), which `IntervalMaps.inputs` convert to b;
-            and ψ (T, C, K); both in single precision.
+            Mean forces and controls (T - 1, E + nu, K) of each interval, whose product with
+            `IntervalMaps.inputs` is the change b of the state in (3); and direct changes ψ
+            (T, C, K) of the readings of C channels. Both are in single precision.
         """
         count, samples = len(effects), self.knots.size
         quotients = self._tangent.quotients
@@ -409,13 +423,21 @@ class MeasuredLinear(RunLinearisation):
         return means, readings
 
     def _compute_interval_means(self, inputs: Array) -> Array:
-        """Return interval means (T - 1, E + nu, K) of forces and controls (S, E + nu, K)."""
+        """Return means of forces and controls over the intervals between samples.
+
+        Args:
+            inputs: (S, E + nu, K) forces and controls in each step.
+
+        Returns:
+            (T - 1, E + nu, K) means; zero for an interval without a step.
+        """
         lengths = np.diff(self.knots)
         non_empty = np.flatnonzero(lengths)
-        result = np.zeros((lengths.size, *inputs.shape[1:]))
+        means = np.zeros((lengths.size, *inputs.shape[1:]))
+        # Sums from the first step of each interval to that of the next one.
         sums = np.add.reduceat(inputs[: self.knots[-1]], self.knots[:-1][non_empty], axis=0)
-        result[non_empty] = sums / lengths[non_empty][:, None, None]
-        return result
+        means[non_empty] = sums / lengths[non_empty][:, None, None]
+        return means
 
     @cached_property
     def _input_responses(self) -> Array:
@@ -433,21 +455,24 @@ class MeasuredLinear(RunLinearisation):
     ) -> Array:
         """Compute the direct changes ψ (T, C, K) of readings by K candidate effects.
 
-        They do not pass through the motion; an example is the bias of a sensor. Sensor effects
-        may be nonlinear, so they are applied to the readings of the predicted motion, and the
-        readings without them are subtracted. Candidates that change no reading are skipped.
+        They do not pass through the motion; an example is the bias of a sensor. The candidates are:
 
-        Shapes: S steps, T samples, C channels.
+        * Without sensor effects, an effect in the model may still change a reading directly, such
+          as a force in a drive that a sensor shows. It is applied to the given motion.
+        * Sensor effects may be nonlinear, so they are applied to the readings of the predicted
+          motion, and those readings without them are subtracted.
+        * Candidates that change no reading are skipped.
 
         Args:
-            read: (S, O, K) direct changes of readings by effects in the model.
+            read: (S, O, K) direct changes of O readings by effects in the model, in each of S
+                steps.
             sensors: sensor effects of each of the K candidates.
-            predicted: (T, Z) predicted deviations, to whose readings sensor effects are applied.
+            predicted: (T, Z) deviations of the predicted motion from the given one at T samples.
         """
-        changes_of_readings = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
+        direct_changes = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
         changing = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
         if not changing:
-            return changes_of_readings
+            return direct_changes
         has_sensor_effect = np.array([bool(sensors[k]) for k in changing])
         # The last row has no sensor effects; it is the reference for the others.
         states = np.zeros((len(changing) + 1, self._motion.x.shape[0], self._tangent.state_size))
@@ -466,19 +491,23 @@ class MeasuredLinear(RunLinearisation):
         without_effects = np.where(
             has_sensor_effect[:, None, None], observations[-1], self.observed
         )
-        changes_of_readings[:, :, changing] = np.moveaxis(observations[:-1] - without_effects, 0, 2)
-        return changes_of_readings
+        direct_changes[:, :, changing] = np.moveaxis(observations[:-1] - without_effects, 0, 2)
+        return direct_changes
 
     def propagate_deviations(self, deviations: Array, forces: Array) -> Array:
-        """Propagate deviations at samples to all steps, (S + 1, Z), by the linear model (2).
+        """Propagate deviations at samples to all steps by the linear model (2).
 
-        In each step a deviation δ becomes A δ - d + B f, with the defect d of the step.
-
-        Shapes: S steps, T samples.
+        In each step a deviation δ of the state becomes A δ - d + B f, with the defect d of the step
+        and the derivatives A and B by the state and the force f. At each sample the deviation is
+        the given one again.
 
         Args:
-            deviations: δ (T, Z) at the samples.
-            forces: f (T - 1, E), constant between samples.
+            deviations: (T, Z) deviations δ at the T samples.
+            forces: (T - 1, E) forces f, constant between samples.
+
+        Returns:
+            (S + 1, Z) deviations at the beginnings of the S steps and at the end; after the last
+            sample they are constant.
         """
         tangent = self._tangent
         points, quotients = tangent.point_of_step, tangent.quotients
@@ -487,59 +516,59 @@ class MeasuredLinear(RunLinearisation):
         deviations_at_steps = np.zeros((self._motion.x.shape[0], tangent.state_size))
         state = deviations[:-1].copy()
         with np.errstate(all="ignore"):
-            for steps, active in self._list_active_intervals():
-                deviations_at_steps[steps] = state[active]
-                ahead = np.einsum("izy,iy->iz", quotients.states[points[steps]], state[active])
-                forced = np.einsum("ize,ie->iz", quotients.forces[points[steps]], forces[active])
-                state[active] = ahead - defects[steps] + forced
+            for steps, intervals in self._list_active_intervals():
+                deviations_at_steps[steps] = delta = state[intervals]
+                a, b = quotients.states[points[steps]], quotients.forces[points[steps]]
+                propagated = np.einsum("izy,iy->iz", a, delta)
+                forced = np.einsum("ize,ie->iz", b, forces[intervals])
+                state[intervals] = propagated - defects[steps] + forced
         deviations_at_steps[self.knots[-1] :] = deviations[-1]
         return deviations_at_steps
 
     def moved(self, deviations: Array) -> Trajectory:
-        """Return the motion plus deviations (S + 1, Z) of its states, such as a smoother's.
+        """Return the motion plus deviations of its states, such as those of a smoother.
 
         Args:
-            deviations: (S + 1, Z) deviations at the beginnings of the S steps and at the end:
-                positions and velocities of the joints, activations, hidden states, and pose and
-                rate of a floating base.
+            deviations: (S + 1, Z) deviations at the beginnings of the S steps and at the end. The
+                columns are positions and velocities of the joints, activations, hidden states of
+                effects, and displacements and velocities of floating bodies.
+
+        Returns:
+            The motion of the file's joints and of floating bodies; other deviations are ignored.
         """
         # The motion is not changed where the linear model diverges.
         deviations = np.where(np.abs(deviations) < MAX_DEVIATION, deviations, 0.0)
         joints, motion = len(self._simulator.addresses.positions), self._motion
         size, na = motion.x.shape[1], motion.act.shape[1]
-        floating = self._simulator.make_linearisation_batch(self._work.acting).floating
         first_floating = 2 * size + na + len(self._tangent.hidden_state_effects)
-        floating_count = motion.floating_state.rate.shape[1]
+        displacements, rates = np.split(deviations[:, first_floating:], 2, axis=1)
         pose = motion.floating_state.pose
-        if floating_count:
-            pose = floating.displaced(
-                pose, deviations[:, first_floating : first_floating + floating_count]
-            )
-        rate = (
-            motion.floating_state.rate
-            + deviations[:, first_floating + floating_count : first_floating + 2 * floating_count]
-        )
+        if displacements.size:
+            floating = self._simulator.make_linearisation_batch(self._work.acting).floating
+            pose = floating.displace(pose, displacements)
         return Trajectory(
             motion.x[:, :joints] + deviations[:, :joints],
             motion.v[:, :joints] + deviations[:, size : size + joints],
-            FloatingState(pose, rate),
+            FloatingState(pose, motion.floating_state.rate + rates),
         )
 
 
 def compute_transmission_loads(
     simulator: RobotSimulator, acting: ActiveEffects, motion: RobotMotion
 ) -> Array:
-    """Compute the loads (2, S, D) of the transmissions in a motion.
+    """Compute the loads of the transmissions in a motion, on which their friction depends.
 
-    The two kinds of load are the forces `TRANSMISSION_FORCE_FIELDS` of MuJoCo, on which friction of
-    a transmission depends.
-
-    Shapes: S steps, D joints.
+    They are the forces on both sides of a transmission: those of the actuators, and those of
+    gravity and motion (`TRANSMISSION_FORCE_FIELDS` of MuJoCo). They are evaluated at the
+    linearisation points; all steps of a point have its loads.
 
     Args:
         simulator: simulator of the robot.
         acting: active effects.
         motion: motion whose own loads are used only by effects with hidden states.
+
+    Returns:
+        (2, S, D) loads of D joints in S steps.
     """
     mujoco_batch = simulator.make_linearisation_batch(acting)
     outputs = [
@@ -552,15 +581,16 @@ def compute_transmission_loads(
     )
     with np.errstate(all="ignore"), capture_mujoco_warnings():
         _, loads = points.compute_accelerations(acting)
-    joints = motion.x.shape[1]
-    return np.stack([loads[points.point_of_step, :joints], loads[points.point_of_step, joints:]])
+    # The outputs are the first field at all joints, then the second one.
+    return np.stack(np.split(loads[points.point_of_step], 2, axis=1))
 
 
 def interpolate_quintic(times: Array, samples: Array, instants: Array) -> tuple[Array, Array]:
     """Interpolate by quintic Hermite polynomials, and extrapolate linearly.
 
     The polynomial of fifth degree between two samples has the given value, first and second
-    derivative at both ends. It is extrapolated since a motion has one step more than its run.
+    derivative at both ends. Before the first and after the last sample, the value continues with
+    the slope there, since a motion has one step more than its run.
 
     Args:
         times: (T,) sample times, ascending.
@@ -573,8 +603,9 @@ def interpolate_quintic(times: Array, samples: Array, instants: Array) -> tuple[
     within = np.clip(instants, times[0], times[-1])
     below = np.clip(np.searchsorted(times, within, side="right") - 1, 0, times.size - 2)
     h = times[below + 1] - times[below]
-    s = (within - times[below]) / h
+    s = (within - times[below]) / h  # from 0 to 1 between two samples
     (x0, v0, a0), (x1, v1, a1) = samples[below].T, samples[below + 1].T
+    # Derivatives by s.
     v0, a0, v1, a1 = h * v0, h * h * a0, h * v1, h * h * a1
     # Coefficients of the polynomial in s with these values at 0 and at 1.
     c2 = 0.5 * a0

@@ -18,6 +18,7 @@ from sims.robot.dynamics.applied_inputs import (
 from sims.robot.dynamics.joint_scales import compute_floating_forces, compute_joint_scales
 from sims.robot.dynamics.linearisation_points import (
     LINEARISATION_INTERVAL_SECONDS,
+    TRANSMISSION_FORCE_FIELDS,
     LinearisationPoints,
     RobotMotion,
 )
@@ -69,12 +70,6 @@ class RunLinearisation:
     ) -> None:
         """Simulate the run, and prepare the tangent linear model about its motion.
 
-        `self._sensor_channels` are the channels that observe MuJoCo's sensors: drive forces
-        (tau.) and sensors (s.). `self._preparation_count` is the number of batch elements that the
-        preparation took; it is part of the cost.
-
-        Shapes: D joints.
-
         Args:
             simulator: simulator of the robot.
             theta: (dim,) parameters.
@@ -90,6 +85,7 @@ class RunLinearisation:
         acting = simulator.get_active_effects(theta[None])
         commands = simulator.run_inputs(scenario)
         self._work = RobotRunBatch(scenario, commands, acting, x[None], v[None])
+        # Channels that observe MuJoCo's sensors: drive forces (tau.) and sensors (s.).
         self._sensor_channels = [
             c.name for c in simulator.channels if c.name.startswith(("tau.", "s."))
         ]
@@ -114,34 +110,30 @@ class RunLinearisation:
         """Simulate the motion of the run, about which the model is linearised.
 
         One more step is added, so that the state at the run's end is the beginning of a step like
-        all others. The forces on both sides of the transmissions are noted, on which some effects
-        depend. The sensors' readings at the beginnings of the steps are kept in `_readings`.
+        all others. The motion includes the forces on both sides of the transmissions, on which some
+        effects depend. The sensors' readings (S,) at the beginnings of the steps are stored in
+        `_readings`, by channel.
         """
         simulator = self._simulator
         steps = self._steps + 1
         inputs = simulator.compute_controls(self._work, steps)
-        extra_fields = ("qfrc_actuator", "qfrc_bias", "act")
-        simulated = simulator.step_batch(self._work, inputs, extra_fields)
+        simulated = simulator.step_batch(self._work, inputs, (*TRANSMISSION_FORCE_FIELDS, "act"))
         mujoco_batch = simulator.make_linearisation_batch(self._work.acting)
+        # The batch has one element.
+        fields = {name: values[0] for name, values in simulated.fields.items()}
         dofs = mujoco_batch.all_joints.velocities
-        sides = ("qfrc_actuator", "qfrc_bias")
-        controls = inputs.controls[0]
-        forces_at_start = np.stack([simulated.fields[name][0][:, dofs] for name in sides])
-        carried = (
-            compute_midpoint_loads(forces_at_start, controls)
-            if forces_are_at_step_end(mujoco_batch.model)
-            else forces_at_start
-        )
-        act = simulated.fields["act"][0]
-        first_activations = simulated.initial_activations[0][None]
-        data = simulated.fields["sensordata"][0] if self._sensor_channels else np.zeros((steps, 0))
+        carried = np.stack([fields[name][:, dofs] for name in TRANSMISSION_FORCE_FIELDS])
+        if forces_are_at_step_end(mujoco_batch.model):
+            carried = compute_midpoint_loads(carried, inputs.controls[0])
         self._readings = {
-            name: data[:, simulator.get_sensor_address(name)] for name in self._sensor_channels
+            name: fields["sensordata"][:, simulator.get_sensor_address(name)]
+            for name in self._sensor_channels
         }
+        series_x, series_v = simulated.series
         return RobotMotion(
-            x=np.concatenate([simulated.x[0], simulated.series[0][0]], axis=1),
-            v=np.concatenate([simulated.v[0], simulated.series[1][0]], axis=1),
-            act=np.concatenate([first_activations, act[:-1]]),
+            x=np.concatenate([simulated.x[0], series_x[0]], axis=1),
+            v=np.concatenate([simulated.v[0], series_v[0]], axis=1),
+            act=np.concatenate([simulated.initial_activations[:1], fields["act"][:-1]]),
             compute_loads=lambda: carried,
             floating_state=self._get_floating_states(simulated.fields),
             step=simulator.time_step,
@@ -152,11 +144,11 @@ class RunLinearisation:
         """Return the fields of a motion that follow from the commands of the run.
 
         Args:
-            inputs: Applied inputs of a batch of one run.
+            inputs: inputs of a batch with one element.
 
         Returns:
-            Fields of the motion by name: controls, forces, inputs at the beginnings of steps, and
-            steps in which drives are off.
+            Arguments of `RobotMotion` by name: controls, forces, applied inputs, and steps in which
+            drives are off.
         """
         return {
             "controls": inputs.controls[0],
@@ -169,10 +161,10 @@ class RunLinearisation:
         }
 
     def _get_floating_states(self, fields: Mapping[str, Array]) -> FloatingState:
-        """Return states of floating bodies, at the beginnings of steps and at the end.
+        """Return poses and velocities of floating bodies at the beginnings of steps and at the end.
 
         Args:
-            fields: State of MuJoCo after each step, `qpos` and `qvel`.
+            fields: recorded `qpos` and `qvel` after each step, (1, S, ...).
         """
         start = self._simulator.get_floating_start(self._work)
         floating = self._simulator.make_linearisation_batch(self._work.acting).floating
@@ -183,20 +175,20 @@ class RunLinearisation:
         )
 
     def _make_tangent_model(self) -> TangentModel:
-        """Make the tangent linear model about the motion of the run (first-order propagation).
-
-        It needs typical forces, `sizes` in N or N m, for the finite differences of forces. They
-        are those of the joints of the file, the joints in series (the second joints of flexible
-        drives) and the floating bodies, in this order.
-        """
+        """Make the tangent linear model about the motion of the run (first-order propagation)."""
         simulator = self._simulator
         outputs = [
             ("sensordata", simulator.get_sensor_address(name)) for name in self._sensor_channels
         ]
         mujoco_batch = simulator.make_linearisation_batch(self._work.acting)
-        sizes = compute_joint_scales(simulator.robot).force
-        # A joint in series transmits the force of its joint.
+        # Typical forces in N or N m, for finite differences: of the joints of the file, of joints
+        # in series (the second joints of flexible drives), and of floating bodies. A joint in
+        # series transmits the force of its joint.
+        file_forces = compute_joint_scales(simulator.robot).force
         series_joints = [self._find_series_joint(name) for name in mujoco_batch.robot.series]
+        forces = np.concatenate(
+            [file_forces, file_forces[series_joints], compute_floating_forces(simulator.robot)]
+        )
         points = LinearisationPoints(
             mujoco_batch,
             simulator.robotic,
@@ -207,10 +199,7 @@ class RunLinearisation:
             [self._find_driven_joint(name) for name in self._sensor_channels],
             self.held,
         )
-        sizes = np.concatenate(
-            [sizes, sizes[series_joints], compute_floating_forces(simulator.robot)]
-        )
-        return TangentModel(points, sizes, self.quotients)
+        return TangentModel(points, forces, self.quotients)
 
     def _find_driven_joint(self, channel: str) -> int:
         """Return the number of the joint whose drive force a channel observes; -1 if none."""
@@ -225,32 +214,32 @@ class RunLinearisation:
     def compute_effect_responses(
         self, added: Sequence[EffectWithCoefficients]
     ) -> tuple[Array, int]:
-        """Compute how each effect alone would change the run's observations, to first order.
+        """Compute how each of K effects alone would change the run's observations, to first order.
 
-        Effects are perturbations of forces, controls or model numbers, which are propagated along
-        the motion together, up to `MAX_SIMULTANEOUS_CHANGES` at a time. Effects in series with
-        joints, such as backlash, change the motion much however small they are; these are
-        simulated.
-
-        Shapes: T samples, C channels.
+        1. Simulate the run with each effect in series with a joint. Such an effect, for example
+           backlash, changes the motion much however small it is.
+        2. All others are perturbations of forces, controls or numbers of the model. Propagate them
+           along the motion together, up to `MAX_SIMULTANEOUS_CHANGES` at a time.
 
         Args:
             added: effects with their coefficients.
 
         Returns:
-            (K, T, C) changes of the observations, and the approximate cost as a number of
-            simulations of the run, including the linearisation itself.
+            (K, T, C) changes of the observations at T samples of C channels; and the approximate
+            cost as a number of simulations of the run, including the linearisation itself.
         """
         before = self._tangent.placed_element_count - self._preparation_count
         # The cost must not depend on earlier calls.
         self._perturbation_cache.clear()
         responses = np.zeros((len(added), *self.observed.shape))
         (control_changes,) = compute_control_changes([self], added)
+        # 1. Simulations.
         in_series = [i for i, (effect, _) in enumerate(added) if is_series_effect(effect)]
         if in_series:
             responses[in_series] = (
                 self._simulate_with_effects([added[i] for i in in_series]) - self.observed
             )
+        # 2. Propagation.
         for begin in range(0, len(added), MAX_SIMULTANEOUS_CHANGES):
             block = range(begin, min(begin + MAX_SIMULTANEOUS_CHANGES, len(added)))
             changes, sensors = self._list_changes(added, block, control_changes)
@@ -269,17 +258,19 @@ class RunLinearisation:
         effect_indices: range,
         control_changes: Mapping[int, Sequence[Perturbation]],
     ) -> tuple[list[Perturbation], list[ActiveEffects]]:
-        """Return the perturbations and the sensor effects of some added effects.
+        """Divide some added effects into perturbations of the motion and effects on sensors.
 
-        Effects in series with joints have no perturbation.
+        A family, one effect at all places, may have both. Effects in series with joints have no
+        perturbation.
 
         Args:
             added: effects with their coefficients.
-            effect_indices: indices of the effects; the first owns the perturbations with owner 0.
-            control_changes: changes of the controls by effects on inputs, by number of the effect.
+            effect_indices: indices of the effects; the first owns the perturbations with owner 0,
+                the second those with owner 1, and so on.
+            control_changes: changes of the controls by effects on inputs, by index of the effect.
 
         Returns:
-            Perturbations of the motion, and the sensor effects of each effect.
+            Perturbations of the motion by all these effects, and the sensor effects of each one.
         """
         changes: list[Perturbation] = []
         sensors: list[ActiveEffects] = []
@@ -291,7 +282,8 @@ class RunLinearisation:
                 is_handled_otherwise = isinstance(part, (Sensor, Input)) or is_series_effect(part)
                 if not is_handled_otherwise and k.any():
                     changes += self._list_perturbations(owner, part, k)
-            changes += [c._replace(owner=owner) for c in control_changes.get(effect_index, ())]
+            input_changes = control_changes.get(effect_index, ())
+            changes += [change._replace(owner=owner) for change in input_changes]
         return changes, sensors
 
     def _simulate_with_effects(self, added: Sequence[EffectWithCoefficients]) -> Array:
@@ -300,10 +292,9 @@ class RunLinearisation:
         All are simulated in one batch, in which each element has the effects of the run and one
         more. An added effect that contains a simpler one of the run, as Stribeck friction contains
         Coulomb friction, takes its coefficient over and replaces it.
-
-        Shapes: T samples, C channels.
         """
         count, work = len(added), self._work
+        # Coefficients (k, K, 1): those of the run in all elements, then one added effect in each.
         acting = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
         for element, (effect, c) in enumerate(added):
             for simpler, k in acting[: len(work.acting)]:
@@ -313,17 +304,15 @@ class RunLinearisation:
             coefficients = np.zeros((len(c), count, 1))
             coefficients[:, element, 0] = c
             acting.append((effect, coefficients))
-        starts = np.repeat(work.x, count, axis=0), np.repeat(work.v, count, axis=0)
-        return self._simulator.simulate_observations(
-            work._replace(acting=tuple(acting), x=starts[0], v=starts[1])
-        )
+        x, v = np.repeat(work.x, count, axis=0), np.repeat(work.v, count, axis=0)
+        return self._simulator.simulate_observations(work._replace(acting=tuple(acting), x=x, v=v))
 
     def compute_initial_state_responses(self) -> Array:
-        """Compute observation derivatives (2 D, T, C) by initial positions, then velocities.
+        """Compute the derivatives of observations by initial positions and velocities.
 
         Returns:
-            Derivatives by D initial positions, then by D initial velocities, of C channels at T
-            samples.
+            (2 D, T, C) derivatives by D initial positions, then by D initial velocities, of C
+            channels at T samples.
         """
         with np.errstate(all="ignore"):
             states, readings = self._tangent.propagate_initial_state()
@@ -332,21 +321,24 @@ class RunLinearisation:
         observations = self._compute_observations(
             small_change * states, small_change * readings, [()] * len(states)
         )
-        result: Array = (observations - self.observed) / small_change
-        velocity_column, joints = len(result) // 2, self._joints  # joints in series are left out
-        return np.concatenate([result[:joints], result[velocity_column : velocity_column + joints]])
+        derivatives: Array = (observations - self.observed) / small_change
+        by_position, by_velocity = np.split(derivatives, 2)
+        # Joints in series, which come last, are left out.
+        return np.concatenate([by_position[: self._joints], by_velocity[: self._joints]])
 
     def _list_perturbations(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
         """Return the perturbations by an effect that acts on neither inputs nor sensors.
 
-        There are three ways. An added armature (inertia of a rotor) is the force -c times the
-        joint's acceleration. An effect whose force can be computed is that force along the motion.
-        Any other effect changes numbers of MuJoCo's model: the accelerations with and without it
-        are compared, and the result is cached.
+        The cases are:
+
+        * An added armature (inertia of a rotor) is the force -c times the joint's acceleration.
+        * An effect whose force can be computed is that force along the motion.
+        * Any other effect changes numbers of MuJoCo's model. The accelerations with and without it
+          are compared, and the result is cached.
 
         Args:
-            owner: number of the candidate.
-            effect: effect of the library: a force, friction, input, sensor or contact law.
+            owner: number of the candidate to which the perturbations belong.
+            effect: effect at one place.
             c: (K, 1, 1) its coefficients.
         """
         name = effect.of or effect.name
@@ -362,7 +354,8 @@ class RunLinearisation:
             return self._tangent.perturb_by_force(owner, effect, c)
         key = effect.name, c.tobytes()
         if key not in self._perturbation_cache:
-            # A larger geom would be pressed into another one, or a smaller one lose its contact.
+            # The whole change could press a geom into another one, or end a contact. So only a
+            # small share of it is made, and the result is divided by the share.
             is_geometry = "geom_size" in MODEL_FIELD_EFFECTS[name].fields
             share = GEOMETRY_DIFFERENCE_SHARE if is_geometry else 1.0
             acting = (*self._work.acting, (effect, share * c))
@@ -375,14 +368,14 @@ class RunLinearisation:
         return [Perturbation(owner, forces=forces, readings=readings)]
 
     def _is_centred_spring(self, name: str, joint: int | None) -> bool:
-        """Return whether an effect is a spring about zero, equal to a joint stiffness.
+        """Return whether an effect is a spring at a joint whose rest position is zero.
 
-        In MuJoCo a joint stiffness acts about the rest position qpos_spring. Only where
-        this is zero can the change be computed from the effect's force, which is cheaper
-        than a changed model.
+        The library's springs have the rest position zero, but a joint stiffness in MuJoCo has the
+        rest position `qpos_spring`. Only where both agree can the change be computed from the
+        effect's force, which is cheaper than a changed model.
 
         Args:
-            name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+            name: name of the effect, without its place.
             joint: index of its joint; None if it acts elsewhere.
         """
         if name not in SPRING_EFFECTS or joint is None:
@@ -391,61 +384,59 @@ class RunLinearisation:
         rest = simulator.robot.compiled.qpos_spring[simulator.addresses.positions[joint]]
         return bool(rest == 0.0)
 
-    def _get_inputs_with_effects(self, rows: Sequence[tuple[int, Effect, Array]]) -> RunInputs:
-        """Return the inputs of the run with n batch elements, each with one more input effect.
+    def _get_inputs_with_effects(self, input_effects: ActiveEffects) -> RunInputs:
+        """Return the inputs of the run for n batch elements, each with one more input effect.
 
         So the responses to all input effects are computed together. If the run itself has the same
         effect, its coefficients are replaced in that element.
 
-        Shapes: K coefficients.
-
         Args:
-            rows: For each batch element: an index that is not used here, the effect, and its
-                coefficients (K, 1).
+            input_effects: the further effect of each of the n batch elements, with its coefficients
+                (K, 1, 1).
         """
-        count = len(rows)
+        count = len(input_effects)
         acting: dict[str, tuple[Effect, Array]] = {}
         for e, c in self._work.acting:
             if isinstance(e, Input):
                 acting[e.name] = e, np.repeat(c, count, axis=1)
-        for element, (_, effect, k) in enumerate(rows):
-            if effect.name not in acting:
-                acting[effect.name] = effect, np.zeros((len(k), count, 1))
-            acting[effect.name][1][:, element] = k[:, 0]
+        for element, (effect, k) in enumerate(input_effects):
+            _, coefficients = acting.setdefault(effect.name, (effect, np.zeros((len(k), count, 1))))
+            coefficients[:, element] = k[:, 0]
         steps = len(self._motion.controls)
-        run_inputs = self._work.scenario, self._work.commands, tuple(acting.values())
-        return RunInputs(*run_inputs, count, steps)
+        scenario, commands = self._work.scenario, self._work.commands
+        return RunInputs(scenario, commands, tuple(acting.values()), count, steps)
 
     def _compute_observations(
         self, states: Array, readings: Array, sensors: Sequence[ActiveEffects]
     ) -> Array:
-        """Compute observations (n, T, C) of the perturbed motion, with further sensor effects.
+        """Compute observations (n, T, C) of n perturbed motions, with further sensor effects.
 
         Positions and velocities are those of the motion plus their changes; other channels are
-        sensor readings. Then the sensor effects act on them.
-
-        Shapes: S steps, T samples, C channels.
+        sensor readings plus their changes. Then the sensor effects act on them. The channels are
+        sampled at the T times of the run.
 
         Args:
-            states: (n, S, Z) changes of the states at the beginnings of steps.
-            readings: (n, S, M) changes of the sensor readings.
-            sensors: further sensor effects of each of the n batch elements.
+            states: (n, S, Z) changes of the states at the beginnings of S steps.
+            readings: (n, S, M) changes of the readings of M sensor channels.
+            sensors: further sensor effects of each of the n motions.
         """
         simulator, count = self._simulator, len(states)
         step_count = self._steps + 1
         size = self._motion.x.shape[1]
         run_effects = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._work.acting)
         columns = []
-        at_ends = find_sample_steps(simulator.time_step, self._times, step_count)
+        sample_steps = find_sample_steps(simulator.time_step, self._times, step_count)
         for channel in simulator.channels:
             acting = _select_sensor_effects(channel.name, run_effects, sensors)
-            # A sensor effect that shifts time needs all steps, other channels the samples only.
-            needed_steps = at_ends if preserves_time(acting) else None
+            # If all samples are at beginnings of steps, only these steps are needed. A sensor
+            # effect that shifts time or filters needs all steps.
+            needed_steps = sample_steps if preserves_time(acting) else None
             rows: slice | NDArray[np.intp] = (
                 slice(step_count) if needed_steps is None else needed_steps
             )
             kind, _, joint_name = channel.name.partition(".")
             slopes = None
+            # Velocities follow the `size` positions in a state.
             if kind in ("q", "qd"):
                 j = simulator.system.coordinates.index(f"q.{joint_name}")
                 column = j if kind == "q" else size + j
@@ -470,29 +461,35 @@ def compute_control_changes(
     """Compute the changes of controls by added input effects, such as a gain or a delay.
 
     Input effects act before the robot, so their changes are computed exactly and only propagated
-    to first order. All effects are evaluated as one batch, with an element for each effect at one
-    place (`input_effects`: its index in `added`, the effect, and its coefficients). A changed input
-    is averaged over the whole step, which moves the robot. If drive forces are observed, it is also
-    averaged over an instant at the beginning of the step, which is what a sensor shows; `shares`
-    are these two shares of a step.
+    to first order. The steps are:
+
+    1. List the input effects at one place each. Each is an element of a batch.
+    2. Compute the changed inputs of all runs together: their means over the steps, which move the
+       robot; and, if drive forces are observed, their values at the beginnings of the steps, which
+       a sensor of the drive force shows.
+    3. Subtract the controls of the run's motion.
 
     Args:
         runs: linearisations of runs of one simulator.
-        added: effects with their coefficients.
+        added: effects with their coefficients; those that do not act on inputs are ignored.
 
     Returns:
-        For each run, the changes by number of the effect.
+        For each run, the changes by index of the effect in `added`.
     """
+    # 1. Input effects.
     changes_by_run: list[dict[int, list[Perturbation]]] = [{} for _ in runs]
-    input_effects: list[tuple[int, Effect, Array]] = []
+    effect_indices: list[int] = []
+    input_effects: list[tuple[Effect, Array]] = []
     for effect_index, (effect, c) in enumerate(added):
         for part, k in effect.parts(c[:, None, None]):
             if isinstance(part, Input) and k.any():
-                input_effects.append((effect_index, part, k))
+                effect_indices.append(effect_index)
+                input_effects.append((part, k))
     if not input_effects:
         return changes_by_run
+    # 2. Changed inputs, by run and batch element: for each share of a step, values (S,).
     simulator, names = runs[0]._simulator, runs[0]._sensor_channels
-    inputs = [run._get_inputs_with_effects(input_effects) for run in runs]
+    inputs = [run._get_inputs_with_effects(tuple(input_effects)) for run in runs]
     shares = [1.0]
     if any(name.startswith("tau.") for name in names):
         shares.append(SAME_INSTANT_SHARE)
@@ -503,21 +500,21 @@ def compute_control_changes(
             simulator.time_step, inputs, share
         ):
             for element, series_row in zip(elements.tolist(), values, strict=True):
-                if input_effects[element][1].signal == name:
+                effect, _ = input_effects[element]
+                if effect.signal == name:
                     series.setdefault((run, element), []).append(series_row)
-    for (run, element), values_by_share in sorted(series.items()):
-        effect_index, part, _ = input_effects[element]
-        if part.signal not in control_indices:
+    # 3. Changes of controls.
+    for (run, element), (means, *instants) in sorted(series.items()):
+        effect_index, (effect, _) = effect_indices[element], input_effects[element]
+        if effect.signal not in control_indices:  # a force, which is not an actuator's control
             continue
-        column, motion = control_indices[part.signal], runs[run]._motion
-        mean_change = values_by_share[0] - motion.controls[:, column]
+        column, motion = control_indices[effect.signal], runs[run]._motion
+        mean_change = means - motion.controls[:, column]
         change = Perturbation(
             effect_index,
             actuator=column,
             series=mean_change,
-            instant=values_by_share[1] - motion.instant[:, column]
-            if len(values_by_share) == 2
-            else mean_change,
+            instant=instants[0] - motion.instant[:, column] if instants else mean_change,
         )
         changes_by_run[run].setdefault(effect_index, []).append(change)
     return changes_by_run
@@ -533,9 +530,13 @@ def _select_sensor_effects(
 
     Args:
         channel: name of the channel.
-        run_effects: effects that are active in the run.
-        extra_effects: additional effects for each batch element; the result has coefficients (K, L,
-            1) that are zero in all other elements.
+        run_effects: effects that are active in the run, with coefficients (K, L, 1).
+        extra_effects: additional effects of each of the L batch elements, with coefficients
+            (K, 1, 1).
+
+    Returns:
+        Effects with coefficients (K, L, 1). Those of an additional effect are zero in all elements
+        that do not have it.
     """
     acting = [(e, c) for e, c in run_effects if isinstance(e, Sensor) and e.signal in ("", channel)]
     added: dict[str, tuple[Effect, Array]] = {}
@@ -543,7 +544,8 @@ def _select_sensor_effects(
         for effect, c in parts:
             if effect.signal not in ("", channel):
                 continue
-            if effect.name not in added:
-                added[effect.name] = effect, np.zeros((len(c), len(extra_effects), 1))
-            added[effect.name][1][:, element] = c[:, 0]
+            _, coefficients = added.setdefault(
+                effect.name, (effect, np.zeros((len(c), len(extra_effects), 1)))
+            )
+            coefficients[:, element] = c[:, 0]
     return (*acting, *added.values())

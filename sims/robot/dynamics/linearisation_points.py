@@ -117,11 +117,7 @@ class LinearisationPoints:
         """Choose the points of the motion, and prepare the batch (fields, effects, state).
 
         Also integrate the hidden states of the effects along the motion, since each point
-        needs them. `self._step_effects` are the effects whose forces are evaluated here, because
-        no model field represents them, and `self._drive_effect_forces` (n, D) are the
-        forces that they exert in drives, which a sensor of drive forces shows.
-
-        Shapes: D joints, K coefficients.
+        needs them.
 
         Args:
             mujoco_batch: batch of the robot; its size is the number of points evaluated together.
@@ -133,13 +129,14 @@ class LinearisationPoints:
             joints: addresses of the joints.
             drives: for each output, the number of the joint whose drive force it is; -1 for other
                 outputs.
-            held: interval of the linearisation in seconds.
+            held: time in seconds for which a linearisation is used.
         """
         self.motion, self.acting = motion, acting
         self._mujoco_batch, self._system = mujoco_batch, system
         self._outputs = tuple(outputs)
         self._joints = joints
         self._drives = np.array(tuple(drives) or (-1,) * len(self._outputs), dtype=np.intp)
+        # Forces (n, D) of effects in drives, which a sensor of drive forces shows.
         self._drive_effect_forces = np.zeros((0, 0))
         self._floating = mujoco_batch.floating
         self._dofs = np.append(joints.velocities, self._floating.velocities)
@@ -148,6 +145,7 @@ class LinearisationPoints:
         # the next call.
         self._bind_fields(mujoco_batch)
         self.placed_count = 0
+        # Effects whose forces are evaluated here, because no model field represents them.
         self._step_effects = StepEffects.from_active(acting)
         if any(self._step_effects):
             # The loads are computed with the same batch, so they must be known before it is used.
@@ -162,6 +160,7 @@ class LinearisationPoints:
         self._next_hidden_states: list[HiddenState] = []
         mujoco_batch.batch.reset(stage=0)
         self._reset_state = mujoco_batch.batch.state.copy()
+        # At first, all steps are points, since contacts may change at any of them.
         self.point_steps = np.arange(len(motion.controls))
         changes = self._find_changed_contacts() if mujoco_batch.robot.is_on_ground else None
         self.point_steps, self.point_of_step = _choose_points(motion, self.point_spacing, changes)
@@ -169,8 +168,9 @@ class LinearisationPoints:
     def _find_changed_contacts(self) -> Mask:
         """Return at which of S steps the contacts with the ground have changed, as a mask (S,).
 
-        They show in the derivatives of a step by the position of a floating body. The derivatives
-        have changed if they differ from those at the change before by `MAX_RELATIVE_CHANGE`.
+        They show in the derivatives of a step by the position of a floating body. The contacts
+        count as changed if any derivative differs from that at the last change by more than
+        `MAX_RELATIVE_CHANGE` times the typical largest derivative of a step.
         """
         unmoved, _ = self.step_displaced({}, self.acting)
         columns = []
@@ -183,7 +183,7 @@ class LinearisationPoints:
         limit = MAX_RELATIVE_CHANGE * np.median(np.abs(derivatives).max(axis=1))
         has_changed, reference = np.zeros(len(derivatives), dtype=bool), derivatives[0]
         for step, derivative in enumerate(derivatives):
-            if not np.abs(derivative - reference).max() <= limit:
+            if not np.abs(derivative - reference).max() <= limit:  # also for NaN
                 has_changed[step], reference = True, derivative
         return has_changed
 
@@ -230,16 +230,22 @@ class LinearisationPoints:
     def step_displaced(
         self, moved: Mapping[str, tuple[int, float]], acting: ActiveEffects, steps: int = 1
     ) -> tuple[Array, Array]:
-        """Compute states (N, Z) and readings (N, O) after a step from each of N points.
+        """Make a step from each of N points, with displaced states or inputs.
 
-        One number of the state or inputs is displaced. The difference to the states without
-        displacement, divided by its size, is a column of the derivative of a step.
+        The difference to the result without a displacement, divided by its size, is a column of the
+        derivative of a step.
 
         Args:
-            moved: perturbed column of the initial state or inputs, and the size of the
-                perturbation, by kind: ``q``, ``v``, ``a``, ``p``, ``r``, ``w``, ``f`` or ``u``.
+            moved: index and size of the displacement by its quantity, as in `_place_points`; none
+                if empty.
             acting: effects whose elements are in the model.
             steps: number of steps, for a batch with shorter ones.
+
+        Returns:
+            States (N, Z) after the step, and readings (N, O) of the outputs. A state consists of
+            the positions and velocities of joints, activations, hidden states of effects, and
+            displacements and velocities of floating bodies; displacements are relative to the
+            motion after the step.
         """
         states, readings = [], []
         bind, joints, floating = self._mujoco_batch.batch.bind, self._joints, self._floating
@@ -276,25 +282,27 @@ class LinearisationPoints:
         moved: Mapping[str, tuple[int, float]] | None = None,
         at_centres: bool = False,
     ) -> tuple[Array, Array]:
-        """Compute accelerations (N, E) and readings (N, O) at each point.
-
-        E are all joints and floating bodies, and O the outputs that are read. No step is
-        made, so that the accelerations are those at the state itself.
+        """Compute accelerations and readings at the state of each of N points, without a step.
 
         Args:
             acting: effects whose elements are in the model.
             extra_forces: (N, E) additional forces; none by default.
-            moved: perturbations, as in `step_displaced`; none by default.
+            moved: index and size of a displacement by its quantity, as in `_place_points`; none by
+                default.
             at_centres: whether joints have the state in the middle of the steps that a point stands
                 for, instead of that at the point.
+
+        Returns:
+            Accelerations (N, E) of all joints and floating bodies, and readings (N, O) of the
+            outputs.
         """
         accelerations, readings = [], []
         applied = self._mujoco_batch.batch.bind("qfrc_applied")
-        dofs, begin = self._dofs, 0
+        dofs, begin = self._dofs, 0  # begin: number of points in earlier batches
         for n, ids in self._place_points(moved or {}, acting, at_centres):
             if extra_forces is not None:
                 applied[:n, dofs] += extra_forces[begin : begin + n]
-                begin += n
+            begin += n
             self._mujoco_batch.batch.forward(ids)
             accelerations.append(self._mujoco_batch.batch.bind("qacc")[:n, dofs].copy())
             readings.append(self._read_outputs(n))
@@ -303,7 +311,8 @@ class LinearisationPoints:
     def _read_outputs(self, n: int) -> Array:
         """Read the O outputs from the first n elements of the batch, (n, O).
 
-        To readings of drive forces, the forces that effects exert in the drive are added.
+        Readings of drive forces include the forces that effects exert in the drive, which MuJoCo
+        does not know.
         """
         bind = self._mujoco_batch.batch.bind
         columns = [bind(name)[:n, column, None] for name, column in self._outputs]
@@ -336,9 +345,10 @@ class LinearisationPoints:
         caller lets MuJoCo evaluate the batch and reads the results.
 
         Args:
-            moved: displacements for a difference quotient, index and size by quantity: q position,
-                v velocity, a activation, w hidden state, p and r displacement and velocity of
-                floating bodies, f force, u control.
+            moved: displacements for a difference quotient, index and size by quantity: ``q``
+                position of a joint, ``v`` its velocity, ``a`` activation, ``w`` hidden state of an
+                effect, ``p`` displacement of floating bodies, ``r`` their velocity, ``f`` force,
+                ``u`` control.
             acting: active effects.
             at_centres: whether joints have the state of `_interval_centres`.
 
@@ -354,6 +364,7 @@ class LinearisationPoints:
         qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         applied = bind("qfrc_applied")
         na = motion.act.shape[1]
+        # Columns of MuJoCo's data of the quantities to which a displacement is simply added.
         columns = {
             "q": lambda k: qpos[:, joints.positions[k]],
             "v": lambda k: qvel[:, joints.velocities[k]],
@@ -383,9 +394,10 @@ class LinearisationPoints:
             applied[:point_count] = motion.forces[steps]
             if na:
                 bind("act")[:point_count] = motion.act[steps]
+            # Poses are quaternions, which are rotated; hidden states are not in MuJoCo's data.
             for name, (k, size) in moved.items():
                 if name == "p":
-                    poses = floating.displace(motion.floating_state.pose[steps], k, size)
+                    poses = floating.displace_coordinate(motion.floating_state.pose[steps], k, size)
                     qpos[:point_count, floating.positions] = poses
                 elif name != "w":
                     columns[name](k)[:point_count] += size
@@ -395,21 +407,23 @@ class LinearisationPoints:
     def _add_effect_forces(
         self, steps: IndexArray, n: int, state_changes: Mapping[int, float]
     ) -> None:
-        """Add state-dependent effect forces at the states of the batch elements.
+        """Evaluate the effects that no model field represents, at the states of the batch elements.
 
-        They are the forces of effects that no model field represents; dry friction is written into
-        the model's friction limits.
+        Forces are added to the applied forces of the batch, and dry friction is written into the
+        friction limits of its model. Also advance the hidden states of the effects by one step, for
+        `step_displaced`.
 
         Args:
-            steps: steps of the points.
+            steps: (n,) steps of the points.
             n: number of batch elements in use.
-            state_changes: perturbations of hidden states, by their numbers.
+            state_changes: displacements of hidden states, by their numbers.
         """
         effects = self._step_effects
         if not any(effects):
             return
         bind, joints = self._mujoco_batch.batch.bind, self._joints
         motion = self.motion
+        # Snapshot of the displaced states.
         x = bind("qpos")[:n, joints.positions]
         v = bind("qvel")[:n, joints.velocities]
         if any(e.of in LOAD_DEPENDENT_EFFECTS for group in effects for e, _ in group):
@@ -421,18 +435,20 @@ class LinearisationPoints:
         else:
             carried = motion.carried[:, steps]
         snapshot = self._make_snapshot(steps, x, v, carried)
+        # Forces, hidden states and dry friction.
         acting = effects.with_coefficients(np.repeat(effects.coefficients.T, n, axis=0))
         self._drive_effect_forces = compute_drive_effect_forces(acting.forces, snapshot)
-        others = [pair for pair in acting.forces if not is_in_drive(pair[0])]
-        force = self._drive_effect_forces + compute_effect_forces(others, snapshot)
+        other_forces = [(effect, c) for effect, c in acting.forces if not is_in_drive(effect)]
+        force = self._drive_effect_forces + compute_effect_forces(other_forces, snapshot)
         states = [
             HiddenState(hidden.x[steps], hidden.v[steps] + state_changes.get(k, 0.0))
             for k, hidden in enumerate(self._hidden_states)
         ]
         # Hidden states act with their values at the middle of the step.
-        force += compute_hidden_state_forces(
+        hidden_force, _ = compute_hidden_state_forces(
             acting.hidden, (snapshot, snapshot), states, 0.5 * motion.step
-        )[0]
+        )
+        force += hidden_force
         self._next_hidden_states = [
             advance_state(effect, c, snapshot, state, motion.step)
             for (effect, c), state in zip(acting.hidden, states, strict=True)
@@ -465,9 +481,10 @@ class LinearisationPoints:
 
     @contextmanager
     def with_batch(self, mujoco_batch: MujocoBatch) -> Iterator[None]:
-        """Use another batch of the robot within a `with` block, such as one with other masses.
+        """Use another batch within a `with` block, such as one whose model has more elements.
 
-        Its coordinates must be the same as those of the own batch.
+        Args:
+            mujoco_batch: batch of the same robot; its coordinates must be those of the own batch.
         """
         previous = self._mujoco_batch, self._reset_state
         if mujoco_batch is not self._mujoco_batch:
@@ -491,7 +508,7 @@ class LinearisationPoints:
 
     @contextmanager
     def limited_forces(self) -> Iterator[None]:
-        """Read the limited forces of stiff servos within a `with` block, not the outputs.
+        """Read other outputs within a `with` block: the forces of stiff servos with force limits.
 
         They show at which points a force limit is reached, where the linear model is not
         valid.
@@ -506,7 +523,7 @@ class LinearisationPoints:
             self._outputs, self._drives = previous
 
     def compute_mass_matrices(self) -> Array:
-        """Compute the inertia matrix (N, E, E) at each point, by MuJoCo's composite-body algorithm.
+        """Compute the inertia matrix (N, E, E) at each of the N points.
 
         The E rows are those of the joints and of the floating bodies. The active effects may change
         masses, so they are written into the model first.
@@ -525,6 +542,7 @@ class LinearisationPoints:
         for x, pose in zip(self.motion.x[self.point_steps], poses, strict=True):
             data.qpos[joints.positions] = x
             data.qpos[self._floating.positions] = pose
+            # The composite rigid body algorithm.
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_crb(model, data)
@@ -533,12 +551,10 @@ class LinearisationPoints:
         return np.array(matrices)
 
     def compute_drive_reading_changes(self, effect: Effect, c: Array, readings: Array) -> Array:
-        """Compute the changes of drive readings (N, O) by an effect in a drive.
+        """Compute the direct changes (N, O) of readings by an effect in a drive, at the N points.
 
         Such an effect is a force at an actuator, for example that of a supply that sags. A sensor
-        of the drive force shows it at once, before the motion changes.
-
-        Shapes: K coefficients.
+        of the drive force shows it at once, before the motion changes. Other outputs do not change.
 
         Args:
             effect: effect in a drive.
@@ -547,22 +563,24 @@ class LinearisationPoints:
         """
         motion, steps, joint_of_output = self.motion, self.point_steps, self._drives
         is_drive = joint_of_output >= 0
-        # Drive forces that are read are known at the beginning of the step, so they replace the
-        # midpoint forces.
+        # The effect depends on the drive forces, the first of both loads of a transmission. The
+        # motion has those at the middle of a step; readings are at its beginning.
         carried = motion.carried[:, steps].copy()
-        carried[0][:, joint_of_output[is_drive]] = readings[:, is_drive]
+        drive_forces, _ = carried  # views
+        drive_forces[:, joint_of_output[is_drive]] = readings[:, is_drive]
         snapshot = self._make_snapshot(steps, motion.x[steps], motion.v[steps], carried)
         force = compute_drive_effect_forces(((effect, np.repeat(c, steps.size, axis=1)),), snapshot)
         result: Array = np.where(is_drive, force[:, joint_of_output], 0.0)
         return result
 
     def compute_effect_force(self, effect: Effect, c: Array) -> Array:
-        """Compute the forces (S, D) of an effect in the middle of each step.
+        """Compute the forces (S, D) of an effect on the D joints in the middle of each of S steps.
 
-        The effect is evaluated along the unperturbed motion, at all steps at once. Dry
-        friction is the force within its limit that the motion determines.
+        The effect is evaluated along the unperturbed motion, at all steps at once. The cases are:
 
-        Shapes: S steps, D joints, K coefficients.
+        * a hidden state, which is integrated along the motion first,
+        * a force, and
+        * dry friction, the force within its limit that the motion determines.
 
         Args:
             effect: effect with a force, a friction or a hidden state.
@@ -572,18 +590,19 @@ class LinearisationPoints:
         if isinstance(effect, HiddenStateEffect):
             state = self.integrate_hidden_state(effect, c)
             midpoint_state = HiddenState(*(0.5 * (u[1:] + u[:-1]) for u in (state.x, state.v)))
-            return effect.act(coefficients, self.snapshot, midpoint_state)[0]
+            force, _ = effect.act(coefficients, self.snapshot, midpoint_state)
+            return force
         if isinstance(effect, Force):
             return effect.force(coefficients, self.snapshot)
         assert isinstance(effect, Friction)
         assert effect.coordinate is not None
         limit = effect.limit(coefficients, self.snapshot)[:, 0]
-        result = np.zeros_like(self.snapshot.x)
-        result[:, effect.coordinate] = self._compute_dry_friction(effect.coordinate, limit)
-        return result
+        forces = np.zeros_like(self.snapshot.x)
+        forces[:, effect.coordinate] = self._compute_dry_friction(effect.coordinate, limit)
+        return forces
 
     def _compute_dry_friction(self, joint: int, limit: Array) -> Array:
-        """Return the force that dry friction of at most `limit` (S,) adds in each step, (S,).
+        """Return the force that dry friction at a joint adds in each of S steps, (S,).
 
         MuJoCo's dry friction is not a jump of the force with the sign of the velocity. It is a
         constraint that pulls the velocity to zero with a force of at most the limit
@@ -598,7 +617,9 @@ class LinearisationPoints:
         So f changes its sign about 1 / b before v does: 9.5 ms with MuJoCo's defaults, and up to a
         step in the stiff form.
 
-        Shapes: S steps.
+        Args:
+            joint: index of the joint in the motion.
+            limit: (S,) largest force of the friction in N m or N.
         """
         motion, robot = self.motion, self._mujoco_batch.robot
         dof, steps = int(self._joints.velocities[joint]), len(motion.controls)
@@ -609,13 +630,15 @@ class LinearisationPoints:
         return force
 
     def integrate_hidden_state(self, effect: Effect, c: Array) -> HiddenState:
-        """Integrate an effect's hidden state (S + 1, 1) along the motion; empty if it has none.
-
-        Shapes: S steps.
+        """Integrate an effect's hidden state along the motion, which the effect does not change.
 
         Args:
-            effect: effect of the library: a force, friction, input, sensor or contact law.
+            effect: effect at its place.
             c: (K, 1, 1) its coefficients.
+
+        Returns:
+            Hidden states (S + 1, 1) at the beginnings of the S steps and at the end; empty if the
+            effect has none.
         """
         if not isinstance(effect, HiddenStateEffect):
             return HiddenState(np.zeros((0, 1)), np.zeros((0, 1)))
@@ -643,17 +666,18 @@ def _choose_points(
     """Choose the steps at which the model is linearised, one after every `spacing` steps.
 
     The count begins again where a piecewise constant command jumps, an actuator is switched, or a
-    contact changes, because a derivative before the jump is not valid after it.
-
-    Shapes: S steps.
+    contact changes, because a derivative before the jump is not valid after it. So each point
+    stands for the steps from a first step to the next one. The point is the first of its steps, or
+    the middle one if contacts may change.
 
     Args:
         motion: motion at all steps: states, controls and forces.
         spacing: regular number of steps between two points.
-        contact_changes: steps at which a contact changes, as a mask (S,); None if there are none.
+        contact_changes: steps at which a contact changes, as a mask (S,); None if contacts cannot
+            change.
 
     Returns:
-        Steps of the points (N,), and for each step the index of the point that applies (S,).
+        Steps of the N points (N,), and for each of the S steps the index of its point (S,).
     """
     steps = len(motion.controls)
     changes = np.ones(steps, dtype=bool)
@@ -668,10 +692,11 @@ def _choose_points(
     numbers = np.arange(steps)
     last_change = np.maximum.accumulate(np.where(changes, numbers, 0))
     is_first = (numbers - last_change) % spacing == 0
-    first_steps = np.flatnonzero(is_first)
+    point_steps = np.flatnonzero(is_first)
     if contact_changes is not None:
-        first_steps = (first_steps + np.append(first_steps[1:], steps) - 1) // 2
-    return first_steps, np.cumsum(is_first) - 1
+        last_steps = np.append(point_steps[1:], steps) - 1
+        point_steps = (point_steps + last_steps) // 2
+    return point_steps, np.cumsum(is_first) - 1
 
 
 def _repeat_coefficients(acting: ActiveEffects, count: int) -> ActiveEffects:

@@ -62,7 +62,8 @@ class JointStates(NamedTuple):
 def predict_midpoint(x: Array, v: Array, a: Array, step: Array | float) -> tuple[Array, Array]:
     """Predict positions and velocities half a step later, for a constant acceleration.
 
-    Forces that depend on the state are evaluated there, which is accurate to second order.
+    Forces that depend on the state are evaluated there, which is accurate to second order. A
+    velocity that would change its sign keeps its value.
 
     Args:
         x: positions.
@@ -92,86 +93,81 @@ class MidpointPredictor:
     ) -> None:
         """Bind MuJoCo's fields of joint states and joint forces, for the first L elements.
 
-        A bound field is a view of MuJoCo's memory, which shows the present values. `self._last`
-        (2, L, D) holds the transmission loads at the beginning of the previous step.
-
-        Shapes: D joints.
+        A bound field is a view of MuJoCo's memory, which shows the present values.
 
         Args:
             batch: the mujoco.batch.Batch.
-            positions: addresses of the joints' positions.
-            velocities: addresses of the joints' velocities.
+            positions: (D,) addresses of the joints' positions.
+            velocities: (D,) addresses of the joints' velocities.
             loaded: (L,) whether the load of transmissions matters; L is the number of elements in
                 use.
         """
         self._batch = batch
         self._forces_are_at_end = forces_are_at_step_end(batch.model)
         self._loaded, self._needs_loads = loaded, bool(loaded.any())
-        self._first = True
+        self._is_first_step = True
         self.dof_indices = to_slice_if_contiguous(velocities)
         self._fields = [(batch.bind("qpos")[: len(loaded)], to_slice_if_contiguous(positions))]
         for name in ("qvel", "qacc", "qfrc_actuator", "qfrc_bias"):
             self._fields.append((batch.bind(name)[: len(loaded)], self.dof_indices))
-        self._last = np.zeros((2, len(loaded), len(velocities)))
+        # Transmission loads at the beginning of the previous step.
+        self._previous_loads = np.zeros((2, len(loaded), len(velocities)))
         # Factor of the load change in (2), zero where loads do not matter.
         self._share = 0.5 * loaded[:, None]
 
     def read_joint_states(self, has_new_command: Mask) -> JointStates:
-        """Return the joint states at the beginning of a step.
-
-        Shapes: L batch elements.
+        """Return the joint states at the beginning of the next step; called once for each step.
 
         Args:
             has_new_command: (L,) whether commands have changed since the previous step; they are
                 already set.
         """
-        x, v, a, drive, bias = (field[:, places] for field, places in self._fields)
+        x, v, a, drive, bias = (field[:, indices] for field, indices in self._fields)
         # The initial acceleration lacks the applied forces, so it is not used for prediction.
-        first, self._first = self._first, False
-        a = np.zeros_like(a) if first else a
+        is_first_step, self._is_first_step = self._is_first_step, False
+        a = np.zeros_like(a) if is_first_step else a
         if not self._needs_loads:
             return JointStates(x, v, a, drive, bias, drive, bias)
-        loads, midpoint_loads = self._compute_transmission_loads(has_new_command, first)
+        loads, midpoint_loads = self._compute_transmission_loads(has_new_command, is_first_step)
         return JointStates(x, v, a, *loads, *midpoint_loads)
 
     def _compute_transmission_loads(
-        self, has_new_command: Mask, first: bool
+        self, has_new_command: Mask, is_first_step: bool
     ) -> tuple[Array, Array]:
         """Return the transmission loads (2, L, D) at the beginning and at the middle of a step.
 
-        The load at the middle is extrapolated from the change over the previous step:
-        d_k + (d_{k-1, end} - d_{k-1}) / 2 (2). Both loads of the difference have the same command,
-        so that a jump with a command appears in d_k alone. MuJoCo must evaluate the forces again
-        with a new command, or, for some integrators, always.
-
-        Shapes: L batch elements, D joints.
+        With the load d_k at the beginning of step k, that at its middle is extrapolated from the
+        change over the previous step: d_k + (d_{k-1, end} - d_{k-1}) / 2 (2). Both loads of the
+        difference have the same command, so that a jump with a command appears in d_k alone. MuJoCo
+        must evaluate the forces again with a new command. For integrators whose last evaluation is
+        at the beginning of a step, it must always do so, d_{k-1, end} is not known, and both
+        results are d_k.
 
         Args:
             has_new_command: (L,) whether the command changes at the beginning of the step.
-            first: whether it is the first step.
+            is_first_step: whether it is the first step, in which both results are d_k, too.
         """
         end_loads = self._copy_forces()
-        start_loads, previous_loads = end_loads, self._last
+        start_loads, previous_loads = end_loads, self._previous_loads
         to_evaluate = self._loaded & has_new_command if self._forces_are_at_end else self._loaded
         # The fields hold the forces of the previous step's last evaluation. At the first step
         # MuJoCo has already evaluated the batch.
-        if not first and to_evaluate.any():
+        if not is_first_step and to_evaluate.any():
             # Only these batch elements are evaluated, so that no element depends on others.
             self._batch.forward(np.flatnonzero(to_evaluate))
             start_loads = self._copy_forces()
-        self._last = start_loads
-        if first or not self._forces_are_at_end:
+        self._previous_loads = start_loads
+        if is_first_step or not self._forces_are_at_end:
             return start_loads, start_loads
         return start_loads, start_loads + self._share * (end_loads - previous_loads)  # (2)
 
     def _copy_forces(self) -> Array:
         """Return a copy of the drive and bias forces, (2, L, D)."""
-        (drive, dofs), (bias, _) = self._fields[3:]
-        batch_size, joints = len(self._loaded), self._last.shape[-1]
-        result = np.empty((2, batch_size, joints))
-        result[0] = drive[:, dofs]
-        result[1] = bias[:, dofs]
-        return result
+        *_, (drive, dofs), (bias, _) = self._fields
+        loads = np.empty_like(self._previous_loads)
+        loads[0] = drive[:, dofs]
+        loads[1] = bias[:, dofs]
+        return loads
 
 
 def forces_are_at_step_end(model: Any) -> bool:
@@ -184,19 +180,19 @@ def forces_are_at_step_end(model: Any) -> bool:
 
 
 def compute_midpoint_loads(end_loads: Array, controls: Array) -> Array:
-    """Compute transmission loads (2, S, D) at the middle of every step of a motion.
+    """Compute transmission loads (2, S, D) at the middle of every step of a known motion.
 
-    It is the load at the end of the step minus half its growth over the step.
-
-    Shapes: S steps, D joints.
+    It is the load at the end of the step minus half its growth over the step. The two loads are
+    those on both sides of a transmission: the drive's force, and that of gravity and motion.
 
     Args:
-        end_loads: (2, S, D) loads at the ends of the steps, each with its own command.
-        controls: (S, nu) commands.
+        end_loads: (2, S, D) loads at the ends of the S steps, each with the command of its step.
+        controls: (S, nu) commands of the steps.
     """
     growth = np.diff(end_loads, axis=1, prepend=end_loads[:, :1])
     has_jump: Mask = np.any(np.diff(controls, axis=0, prepend=np.nan) != 0, axis=1)
-    # A jump with a command is no growth within the step, so the growth of the next step is used.
+    # Where the command jumps at the beginning of a step, the difference is not a growth within the
+    # step. It is replaced by that of the next step, or by zero if the command jumps there, too.
     next_has_jump = np.append(has_jump[1:], True)
     growth[:, has_jump & next_has_jump] = 0.0
     replaced = np.flatnonzero(has_jump & ~next_has_jump)

@@ -68,28 +68,27 @@ class JointAddresses:
     Attributes:
         positions: (D,) addresses in qpos.
         velocities: (D,) addresses in qvel.
-
-    Args:
-        robot: robot with the joints.
-        series: select the joints in series instead of those of the robot's file.
-        both: select the joints of the file, followed by those in series.
     """
 
     def __init__(self, robot: RobotModel, series: bool = False, both: bool = False) -> None:
-        """Collect the addresses of the selected hinge and slide joints, in file order.
+        """Collect the addresses of hinges and slides: by default, those of the robot's model file.
 
         Args:
-            robot: Robot whose compiled model has the joints.
-            series: Whether to select the second joints of flexible drives, instead of the joints of
-                the file.
-            both: Whether to select both; series joints come last.
+            robot: robot whose compiled model has the joints.
+            series: select the joints that effects have added in series with others instead, such as
+                the second joints of flexible drives.
+            both: select the joints of the file, followed by those in series.
         """
-        one_coordinate_joints = [joint for joint in robot.joints if joint.has_one_coordinate]
-        file_joints = [joint for joint in one_coordinate_joints if joint.name not in robot.series]
+        file_joints = [
+            joint
+            for joint in robot.joints
+            if joint.has_one_coordinate and joint.name not in robot.series
+        ]
         series_joints = [robot.joint(name) for name in robot.series]
-        joints = series_joints if series else file_joints
         if both:
             joints = [*file_joints, *series_joints]
+        else:
+            joints = series_joints if series else file_joints
         self.positions: IndexArray = np.array([j.position for j in joints], dtype=np.intp)
         self.velocities: IndexArray = np.array([j.velocity for j in joints], dtype=np.intp)
 
@@ -119,14 +118,15 @@ def make_batch_spec(robot: RobotModel) -> Any:
 
 
 def compile_batch_model(robot: RobotModel, derived: bool) -> Any:
-    """Compile the model of a batch, with a sensor of the actuator force on each joint.
+    """Compile the model of a batch, with a sensor of the actuator force on each joint of the file.
 
-    A sensor shows the beginning of a step for every integrator. MuJoCo's data would contain the
-    last evaluation of the integrator.
+    A sensor shows the force at the beginning of a step for every integrator. The force in MuJoCo's
+    data would be that of the integrator's last evaluation within the step.
 
     Args:
         robot: robot to simulate.
-        derived: whether masses and centres of mass differ between batch elements.
+        derived: whether masses and centres of mass differ between batch elements, so that MuJoCo
+            derives constants from them again.
     """
     import mujoco
 
@@ -148,20 +148,22 @@ def find_drive_sensors(model: Any, robot: RobotModel) -> dict[str, int]:
     """Return the addresses of actuator forces in the sensor data of a batch model, by joint.
 
     Args:
-        model: batch model, to which the sensors were added.
-        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
+        model: model of `compile_batch_model`, which has the sensors.
+        robot: robot of this model.
     """
-    one_coordinate_joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
-    file_joints = [name for name in one_coordinate_joints if name not in robot.series]
-    return {name: int(model.sensor(DRIVE_SENSOR_PREFIX + name).adr[0]) for name in file_joints}
+    return {
+        joint.name: int(model.sensor(DRIVE_SENSOR_PREFIX + joint.name).adr[0])
+        for joint in robot.joints
+        if joint.has_one_coordinate and joint.name not in robot.series
+    }
 
 
 def with_integrator_settings(robot: RobotModel, settings: Mapping[str, float]) -> RobotModel:
     """Return the robot with other options of its model; the robot itself if they are equal.
 
     Args:
-        robot: robot with the model file.
-        settings: options by name, such as ``timestep``.
+        robot: robot whose model has options already.
+        settings: wanted options by name, such as ``timestep``, as numbers.
     """
     option = robot.compiled.opt
     if all(getattr(option, name) == value for name, value in settings.items()):
@@ -197,8 +199,7 @@ class MujocoBatch:
 
         Expanded fields (numbers of the model, such as masses) have separate values for each batch
         element, so that each simulates other effects. Only fields that effects can write are
-        expanded. `self._file_values` keeps the values of the model file, which are restored before
-        other effects are written.
+        expanded.
 
         Args:
             robot: robot to simulate.
@@ -226,11 +227,12 @@ class MujocoBatch:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.drives = find_drive_sensors(model, robot)
         self.batch: Any = batch.Batch(model, count, 1)
+        # Fields of effects that add elements exist only in a model with these elements.
         field_names = {
             field
-            for native in MODEL_FIELD_EFFECTS.values()
-            if derived or not native.changes_derived_constants
-            for field in native.fields
+            for field_effect in MODEL_FIELD_EFFECTS.values()
+            if derived or not field_effect.changes_derived_constants
+            for field in field_effect.fields
         }
         field_names |= set(USED_FIELDS) if robot.series else set()
         field_names -= set() if robot.coupled else {COUPLING_FIELD}
@@ -238,6 +240,7 @@ class MujocoBatch:
         self.fields: dict[str, Any] = {
             name: self.batch.expand(name) for name in sorted(field_names)
         }
+        # The values of the model file are restored before other effects are written.
         self._file_values = {name: values[:1].copy() for name, values in self.fields.items()}
         self._changed_fields: set[str] = set()
         # Effects in the fields; None if the fields have been changed since they were written.
@@ -262,22 +265,26 @@ class MujocoBatch:
     def write_effects(self, acting: ActiveEffects) -> None:
         """Write effects that are numbers of MuJoCo's model, such as masses, into its fields.
 
-        First the fields that former effects changed get the values of the file again. Then the
-        effects are written in a fixed order, since some depend on others, and MuJoCo recomputes
-        what it derives from the changed fields. Nothing is done if the fields have these effects
-        already. Coefficients are (K, N, 1) for N batch elements.
+        Nothing is done if the fields have these effects already. Otherwise the steps are:
 
-        Shapes: K coefficients.
+        1. Restore the values of the file in the fields that former effects changed.
+        2. Write the effects in a fixed order, since some depend on others.
+        3. Let MuJoCo recompute the constants that it derives from the changed fields.
+
+        Args:
+            acting: effects with coefficients (K, N, 1) for the N batch elements.
         """
         written_effects = tuple((effect.name, c.tobytes()) for effect, c in acting)
         if written_effects == self._written_effects:
             return
+        # 1. Values of the file.
         for name in self._changed_fields:
             self.fields[name][...] = self._file_values[name]
         was_derived = any(self._needs_recomputed_constants(name) for name in self._changed_fields)
         self._changed_fields.clear()
         needs_constants = was_derived or bool(self.robot.series)
-        for effect, c in sorted(acting, key=lambda one: get_write_order(one[0].of)):
+        # 2. Effects; those in series with joints are written together.
+        for effect, c in sorted(acting, key=lambda pair: get_write_order(pair[0].of)):
             if not c.any() or is_series_effect(effect):
                 continue
             field_effect = MODEL_FIELD_EFFECTS[effect.of or effect.name]
@@ -288,15 +295,19 @@ class MujocoBatch:
             # This follows the armature effects, since each drive takes its share of the armature.
             write_series_effects(self.fields, self.robot, acting)
             self._changed_fields.update(WRITTEN_FIELDS)
+        # 3. Derived constants.
         if needs_constants:
             self._recompute_constants(all((c == c[:, :1]).all() for _, c in acting))
         if self.robot.series:
+            # Parameters of compliant flanks depend on the derived inverse inertia.
             convert_flank_parameters(self.fields, self.robot)
         self._loaded_friction = self.fields["dof_frictionloss"].copy()
         self._written_effects = written_effects
 
     def _recompute_constants(self, elements_are_equal: bool) -> None:
-        """Let MuJoCo recompute what it derives from the changed fields.
+        """Let MuJoCo recompute the constants that it derives from the changed fields.
+
+        If all elements are equal, it does so for the first one, whose fields are copied.
 
         Args:
             elements_are_equal: whether all elements have the same effects, so that the constants of
@@ -321,9 +332,9 @@ class MujocoBatch:
 
     @staticmethod
     def _needs_recomputed_constants(field: str) -> bool:
-        """Return whether MuJoCo must recompute derived constants after a field changed.
+        """Return whether MuJoCo must recompute derived constants after the named field changed.
 
-        An example is body_mass, from which MuJoCo derives the inverse weights of bodies and
+        An example is ``body_mass``, from which MuJoCo derives the inverse weights of bodies and
         joints.
         """
         return any(
@@ -337,9 +348,7 @@ class MujocoBatch:
         """Set the initial states of the first n batch elements.
 
         Recordings do not contain the state of joints in series, such as the deflection of a
-        flexible gear. So their equilibrium is computed.
-
-        Shapes: D joints.
+        flexible gear. So they rest at the equilibrium of the links while the drives are held.
 
         Args:
             positions: (n, D) positions of the joints of the file.
@@ -347,8 +356,7 @@ class MujocoBatch:
             floating_state: poses and velocities of floating bodies.
 
         Returns:
-            Initial positions and velocities (n, H) of joints in series: the equilibrium of the
-            links while their drives are held, at rest.
+            Initial positions and velocities (n, H) of the H joints in series; these are zero.
         """
         self.batch.reset(stage=0)
         qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
@@ -360,6 +368,7 @@ class MujocoBatch:
         series = self.series_joints
         series_positions = np.zeros((element_count, series.positions.size))
         if series_positions.size:
+            # The load on a joint in series is that of springs, dampers, gravity and motion.
             passive, bias = self.batch.bind("qfrc_passive"), self.batch.bind("qfrc_bias")
             self.batch.forward(self.get_element_ids(element_count))
             loads = (passive - bias)[:element_count, series.velocities].T
@@ -370,7 +379,10 @@ class MujocoBatch:
         return series_positions, np.zeros_like(series_positions)
 
     def map_forces(self, forces: Array) -> Array:
-        """Map generalised forces (..., nv) of the file's model to this batch's model."""
+        """Map generalised forces (..., nv) of the file's model to this batch's model.
+
+        The model of the batch may have further joints in series, on which no force acts.
+        """
         if self.model.nv == forces.shape[-1]:
             return forces
         file_dofs = np.setdiff1d(np.arange(self.model.nv), self.series_joints.velocities)
@@ -411,6 +423,7 @@ class MujocoBatch:
         """
         import mujoco
 
+        # `input_kinds` tells MuJoCo of which parts its inputs consist.
         state = mujoco.mjtState
         input_kinds = int(state.mjSTATE_CTRL)
         applies_forces = before_call is not None or bool(forces.any())
@@ -442,11 +455,8 @@ class MujocoBatch:
     ) -> Iterator[slice]:
         """Yield the steps in consecutive parts, and switch actuators on or off before each part.
 
-        Within a part no switch changes, so that MuJoCo makes its steps in one call. Before the
-        next part is yielded, its switches are set here; an actuator is switched off by a force
-        range of zero.
-
-        Shapes: S steps.
+        Within a part no switch changes, so that MuJoCo makes its steps in one call. An actuator is
+        switched off by a force range of zero. At the end all are switched on.
 
         Args:
             steps: number S of steps.
@@ -471,28 +481,31 @@ class MujocoBatch:
         return ForceRanges(self.fields)
 
     def get_servo_stiffness(self, joints: JointAddresses) -> Array:
-        """Return the force of position servos per unit of their errors, with effects.
+        """Return the force of position servos per unit of their errors, with the written effects.
 
         Args:
             joints: addresses of D joints.
 
         Returns:
-            (N, D) stiffness; zero for joints without a position servo.
+            (N, D) stiffness, the force on the joint per unit of the set point's error; zero for
+            joints without a position servo. Several servos at one joint are added up.
         """
         robot = self.robot
-        result = np.zeros((self.count, len(joints.velocities)))
-        columns = {int(address): i for i, address in enumerate(joints.velocities)}
+        stiffness = np.zeros((self.count, len(joints.velocities)))
+        column_of_address = {int(address): i for i, address in enumerate(joints.velocities)}
         for actuator in robot.actuators:
             if actuator.kind == "position" and actuator.joint is not None:
                 gear = float(robot.compiled.actuator_gear[actuator.id, 0])
                 gain = self.fields["actuator_gainprm"][:, actuator.id, 0]
-                result[:, columns[robot.joint(actuator.joint).velocity]] += gear * gain
-        return result
+                column = column_of_address[robot.joint(actuator.joint).velocity]
+                stiffness[:, column] += gear * gain
+        return stiffness
 
     def set_dry_friction(self, n: int, dof: int, limit: Array) -> None:
-        """Add dry friction at one joint to the loaded friction of the first n batch elements.
+        """Set the dry friction at one joint of the first n batch elements.
 
-        Friction that was added before is replaced.
+        It is the friction of the model with the effects that are written into it, plus `limit`.
+        So a limit that was set before is replaced.
 
         Args:
             n: number of batch elements.
@@ -503,25 +516,20 @@ class MujocoBatch:
         self.prepare_dry_friction(slice(n), dof)
 
     def prepare_dry_friction(self, batch_indices: Any, dofs: Any) -> None:
-        """Set the solver parameters of dry friction where effects add it.
+        """Set the solver parameters of dry friction at the joints where effects add it.
 
-        Where no effect adds friction, the file's friction keeps its solver parameters.
+        At all others, the file's friction keeps its solver parameters. The next `write_effects`
+        restores all of them.
 
         Args:
-            batch_indices: index of the batch elements.
-            dofs: index of the joints' velocities.
+            batch_indices: NumPy index of the batch elements.
+            dofs: NumPy index of the joints' velocities.
         """
         self._mark_changed(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
         write_friction_form(self.fields, self.robot, batch_indices, dofs)
 
     def _allocate_records(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
-        """Allocate arrays for recorded fields.
-
-        Args:
-            n: number of batch elements.
-            steps: number of recorded steps.
-            record: names of the fields of MuJoCo's data.
-        """
+        """Allocate an array (n, steps, ...) for each field of MuJoCo's data to record, by name."""
         return {name: np.empty((n, steps, *self.batch.bind(name).shape[1:])) for name in record}
 
     def get_element_ids(self, n: int) -> IndexArray | None:
@@ -589,13 +597,13 @@ class BatchCache:
         """Return a batch of simulations from the cache, or create it.
 
         Creating a batch compiles the model, which takes much longer than a simulation. A model that
-        MuJoCo rejects is stored with the reason, which is printed, and is not compiled again.
+        MuJoCo rejects is not compiled again: the reason is stored, and printed once.
 
         Args:
-            added: elements that effects add to the model.
-            derived: whether masses or armatures change.
+            added: elements that effects add to the model, as pairs of place and effect.
+            derived: whether masses or armatures change, from which MuJoCo derives constants.
             count: number of batch elements.
-            settings: options of the model, as for `sims.robot.dynamics.mujoco_batch.MujocoBatch`.
+            settings: options of the model by name, such as ``timestep``.
 
         Raises:
             RefusedModelError: MuJoCo cannot compile the model with these added elements.
@@ -610,7 +618,7 @@ class BatchCache:
                 self._evict_unused_variants()
             return variant.batches[key]
         except ValueError as error:
-            if not added:
+            if not added:  # The robot's own model has compiled before.
                 raise
             effects = ", ".join(f"{effect}@{place}" if place else effect for place, effect in added)
             said = f"{effects}: MuJoCo does not compile the model: {format_mujoco_error(error)}"
@@ -619,10 +627,10 @@ class BatchCache:
             raise RefusedModelError(said) from None
 
     def _get_variant(self, added: AddedElements) -> _Variant:
-        """Return the model with these added elements, and mark it as most recently used.
+        """Return the robot with added elements and its batches, and mark it as most recently used.
 
         Without added elements, this is the robot's own model, which is never dropped from
-        the cache.
+        the cache. Otherwise it is made if the cache does not have it.
         """
         if not added:
             return self._own
@@ -632,9 +640,9 @@ class BatchCache:
         return variant
 
     def _evict_unused_variants(self) -> None:
-        """Drop the least recently used variants of the batch until their memory is within limits.
+        """Drop the least recently used models with added elements, until the limit of memory holds.
 
-        The last variant is in use, and stays.
+        The last one is in use, and stays.
         """
         sizes = {added: variant.nbytes for added, variant in self._extended.items()}
         for added in list(sizes)[:-1]:

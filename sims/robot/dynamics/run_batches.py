@@ -56,23 +56,22 @@ class RobotRunBatch(NamedTuple):
 
 
 def list_last_read_times(work: RobotRunBatch) -> Array:
-    """Return the last time, (1,), at which a sensor is read in a run, in seconds since the start.
+    """Return the last time at which a sensor is read in a run, in seconds since its start.
 
     The simulation must last until then. Without effects on sensors it is the last time stamp. If
     an effect makes the clock of the recording slow, the true time is later.
+
+    Returns:
+        An array (1,) with the time, which is limited as `MAX_DURATION_FACTOR` states.
     """
-    end = work.times[-1:]
-    latest = float(end[0])
-    for effect, coefficients in work.acting:
+    last_stamp = float(work.times[-1])
+    latest = last_stamp
+    for effect, c in work.acting:
         if isinstance(effect, Sensor):
-            latest = max(
-                latest,
-                float(
-                    np.max(effect.times(coefficients, np.broadcast_to(end, coefficients[0].shape)))
-                ),
-            )
+            true_times = effect.times(c, np.full(c[0].shape, last_stamp))
+            latest = max(latest, float(np.max(true_times)))
     # Implausible values that a fit tries must not cost thousands of steps.
-    return np.array([min(latest, MAX_DURATION_FACTOR * float(end[0]) + MAX_EXTRA_SECONDS)])
+    return np.array([min(latest, MAX_DURATION_FACTOR * last_stamp + MAX_EXTRA_SECONDS)])
 
 
 class BatchStart(NamedTuple):
@@ -114,8 +113,9 @@ class BatchInputs(NamedTuple):
     def concatenate(cls, parts: Sequence[BatchInputs]) -> BatchInputs:
         """Join the inputs of several runs, so that one batch simulates all of them.
 
-        All runs then have as many steps as the longest; shorter ones repeat their last
-        inputs, and the additional steps are ignored afterwards.
+        The batch elements of the runs follow one another. All runs then have as many steps as the
+        longest; shorter ones repeat their last inputs, and the additional steps are ignored
+        afterwards.
         """
         if len(parts) == 1:
             return parts[0]
@@ -145,17 +145,21 @@ def _extend_to_steps(values: NDArray[Number], steps: int) -> NDArray[Number]:
 
 
 def group_by_run(runs: ScenarioGroups, batch_indices: IndexArray) -> list[tuple[int, IndexArray]]:
-    """Group consecutive batch elements by their runs.
+    """Group batch elements by their runs.
+
+    Args:
+        runs: runs (scenarios), and the number of the run of each batch element.
+        batch_indices: indices of the batch elements; those of one run follow one another.
 
     Returns:
         For each group, the number of the run and the indices of its batch elements.
     """
     if not batch_indices.size:
         return []
-    borders = np.flatnonzero(np.diff(runs.scenario_index[batch_indices])) + 1
-    return [
-        (int(runs.scenario_index[group[0]]), group) for group in np.split(batch_indices, borders)
-    ]
+    run_numbers = runs.scenario_index[batch_indices]
+    begins_run = np.flatnonzero(np.diff(run_numbers)) + 1
+    groups = np.split(batch_indices, begins_run)
+    return [(int(runs.scenario_index[group[0]]), group) for group in groups]
 
 
 class BatchResult(NamedTuple):
@@ -191,20 +195,16 @@ def group_batch_elements(acting: ActiveEffects, count: int) -> Iterator[IndexArr
     Their effects add the same elements to the model; all or none of them change constants that
     MuJoCo derives; and the forces of all or none are evaluated in every step.
 
-    Shapes: L batch elements, K coefficients.
-
     Args:
         acting: active effects, with coefficients (K, L, 1).
         count: number L of batch elements.
     """
-    kinds = np.stack(
-        [
-            find_active_elements(acting, count, needs_work)
-            for needs_work in (is_evaluated_per_step, changes_derived_constants)
-        ]
-    )
-    for indices in group_by_added_elements(acting, count).values():
-        for kind in product((False, True), repeat=2):
-            is_in_group = np.all(kind == kinds[:, indices].T, axis=1)
+    has_step_forces = find_active_elements(acting, count, is_evaluated_per_step)
+    has_changed_constants = find_active_elements(acting, count, changes_derived_constants)
+    for indices in map(np.array, group_by_added_elements(acting, count).values()):
+        for with_forces, with_constants in product((False, True), repeat=2):
+            is_in_group = (has_step_forces[indices] == with_forces) & (
+                has_changed_constants[indices] == with_constants
+            )
             if is_in_group.any():
-                yield np.array(indices)[is_in_group]
+                yield indices[is_in_group]

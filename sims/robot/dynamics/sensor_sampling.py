@@ -35,10 +35,10 @@ def sample_readings(
 ) -> Array:
     """Compute the recorded readings (L, T) of a channel, including sensor effects.
 
-    A sensor effect can shift the time at which a sample is taken (delay, drifting clock), filter
-    the signal, or change each reading (bias, gain). They are applied in this order: the values are
-    read at the shifted times, filtered signals replace them where a filter acts, and then each
-    reading is changed.
+    1. Shift the times at which samples are taken (effects such as a delay or a drifting clock), and
+       interpolate the values there.
+    2. Where a filter acts, replace them by samples of the filtered signal.
+    3. Change each reading (effects such as a bias or a gain).
 
     Shapes: L batch elements, S steps, T samples.
 
@@ -48,24 +48,26 @@ def sample_readings(
         step: step length in seconds.
         times: (T,) recorded time stamps in seconds since the start.
         sensors: effects on this channel in the order in which a signal passes them.
-        clock: first recorded time stamp in seconds.
+        clock: first recorded time stamp in seconds, on which effects such as a drift depend.
     """
+    # 1. Sample times.
     batch_size, count = values.shape
     step_ends = step * np.arange(count)
     instants = np.broadcast_to(times, (batch_size, times.size))
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
-        if type(effect).times is not Sensor.times:
+        if type(effect).times is not Sensor.times:  # The effect shifts times.
             instants = np.where(is_active(c), effect.times(c, instants), instants)
     instants = np.clip(instants, 0.0, step_ends[-1])
     result = _interpolate(values, slopes, step, instants)
-    # A filter needs the signal at all steps, not only at the samples.
+    # 2. Filters. They need the signal at all steps, not only at the samples.
     for filtered_elements, filters in _iterate_filters(sensors):
         grid = np.broadcast_to(step_ends, (filtered_elements.size, count))
         steps = np.diff(grid, axis=1, prepend=0.0)
         filtered = apply_sensor_effects(filters, values[filtered_elements], steps, grid, clock)
         # The slope of a filtered signal is unknown.
         result[filtered_elements] = _interpolate(filtered, None, step, instants[filtered_elements])
+    # 3. Changes of readings.
     return apply_effects_to_readings(result, times, sensors, clock)
 
 
@@ -87,22 +89,22 @@ def apply_effects_to_readings(
     Returns:
         The changed readings (L, T).
     """
-    affected = readings
-    stamps = np.broadcast_to(times, affected.shape)
+    stamps = np.broadcast_to(times, readings.shape)
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
+        # Filters, and effects that only shift times, have been applied before.
         if effect.filters or type(effect).read is Sensor.read:
             continue
         active_elements = np.flatnonzero(is_active(c))
         signal = Signal(
-            affected[active_elements],
-            np.zeros_like(affected[active_elements]),
-            affected[active_elements, :1],
+            readings[active_elements],
+            np.zeros_like(readings[active_elements]),
+            readings[active_elements, :1],
             stamps[active_elements],
             clock,
         )
-        affected[active_elements] = effect.read(c[:, active_elements], signal)
-    return affected
+        readings[active_elements] = effect.read(c[:, active_elements], signal)
+    return readings
 
 
 def find_sample_steps(step: float, times: Array, count: int) -> NDArray[np.intp] | None:
@@ -131,23 +133,26 @@ def preserves_time(sensors: ActiveEffects) -> bool:
 
 
 def _iterate_filters(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp], ActiveEffects]]:
-    """Yield the batch elements with an active filter, and the filters there, if any."""
+    """Yield once the batch elements with an active filter, and the filters there; or nothing.
+
+    Args:
+        sensors: sensor effects with coefficients (K, L, 1); those that filter nothing are ignored.
+    """
     filters = tuple((e, c) for e, c in sensors if isinstance(e, Sensor) and e.filters)
-    on = [is_active(c)[:, 0] for _, c in filters]
-    batch_indices = np.flatnonzero(np.any(on, axis=0)) if filters else np.empty(0, dtype=np.intp)
+    is_filtered = [is_active(c)[:, 0] for _, c in filters]
+    batch_indices = np.flatnonzero(np.any(is_filtered, axis=0)) if filters else np.zeros(0, np.intp)
     if batch_indices.size:
         yield batch_indices, tuple((e, c[:, batch_indices]) for e, c in filters)
 
 
 def _interpolate(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
-    """Interpolate values, which are known at the ends of steps, at the times of samples.
+    """Interpolate values (L, T), which are known at the ends of S steps, at the times of T samples.
 
-    With slopes, the cubic Hermite polynomial (1) is used, otherwise a straight line.
+    Without slopes, the values are interpolated linearly. Otherwise, with values a, b and slopes
+    a', b' at the ends of a step of length h, the value at the fraction s of the step is the cubic
+    Hermite polynomial (1)
 
-    Shapes: L batch elements, S steps, T samples.
-
-    With values a, b and slopes a', b' at the ends of a step h: y = (1 + 2s)(1 - s)^2 a + s(1 - s)^2
-    h a' + s^2 (3 - 2s) b - s^2 (1 - s) h b' (1), at the fraction s.
+        (1 + 2s)(1 - s)^2 a + s(1 - s)^2 h a' + s^2 (3 - 2s) b - s^2 (1 - s) h b'
 
     Args:
         values: (L, S + 1) values at the ends of steps.

@@ -77,9 +77,10 @@ SeriesJoints = tuple[tuple[str, str], ...]
 
 
 def make_series_joint_name(joint: str, effects: Collection[str]) -> str:
-    """Make the name of a second joint, such as ``elbow_flexibility``.
+    """Make the name of the joint that is added in series with a joint for some effects.
 
-    It is ``elbow_transmission`` for several effects.
+    It is ``elbow_flexibility`` for the effect ``joint.flexibility`` alone, and
+    ``elbow_transmission`` for several effects.
 
     Args:
         joint: name of the joint with which it is in series.
@@ -112,11 +113,12 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
 
     The first joint then moves the drive, and the second one the links against the drive. It is in
     the same body, with the axis and position of the first one. All its numbers are zero;
-    `write_series_element` sets them for each batch element. Existing names do not change.
+    `write_series_element` sets them for each batch element. With backlash it has a limited range.
+    Existing names do not change. Keyframes are removed.
 
     Args:
         robot: robot as read from its model file.
-        added: joints, each the last one of its body, with the effect in series.
+        added: pairs of a joint, the last one of its body, and an effect in series with it.
     """
     import mujoco
 
@@ -124,23 +126,22 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
     inertias = _compute_joint_inertias(robot)
     for name, effects in group_by_joint(added).items():
         first_joint = spec.joint(name)
-        # Default classes of the file apply to the first joint only.
-        zero_attributes = {"damping": 0.0, "frictionloss": 0.0, "armature": 0.0, "stiffness": 0.0}
         second_joint = first_joint.parent.add_joint(
             name=make_series_joint_name(name, effects),
             type=first_joint.type,
             axis=first_joint.axis,
             pos=first_joint.pos,
         )
-        for attribute, value in zero_attributes.items():
-            setattr(second_joint, attribute, np.full_like(getattr(second_joint, attribute), value))
+        # Values of default classes of the file apply to the first joint only.
+        for attribute in ("damping", "frictionloss", "armature", "stiffness"):
+            setattr(second_joint, attribute, np.zeros_like(getattr(second_joint, attribute)))
         second_joint.springdamper = (0.0, 0.0)
         second_joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         has_backlash = any(effect.endswith("backlash") for effect in effects)
         limited = mujoco.mjtLimited
         second_joint.limited = limited.mjLIMITED_TRUE if has_backlash else limited.mjLIMITED_FALSE
         if has_backlash:
-            second_joint.range = (-1.0, 1.0)
+            second_joint.range = (-1.0, 1.0)  # a placeholder, which lets the model compile
         # The simulation writes the actual armature; this minimum makes the model compile.
         first_joint.armature = max(first_joint.armature, COMPILE_INERTIA_SHARE * inertias[name])
     # Keyframes lack the new coordinates.
@@ -171,15 +172,13 @@ def write_series_effects(
 ) -> None:
     """Write effects in series with joints, such as backlash, into the model fields of a batch.
 
-    Several effects at one joint are combined to one element. `convert_flank_parameters` must be
-    called after MuJoCo has derived its constants.
-
-    Shapes: L batch elements, K coefficients.
+    Several effects at one joint are combined to one element: a spring, a gap, or both. For gaps,
+    `convert_flank_parameters` must be called after MuJoCo has derived its constants.
 
     Args:
         fields: model fields of the batch elements.
         robot: robot of `add_series_joints`.
-        acting: effects with coefficients (K, L, 1); other effects are ignored.
+        acting: effects with coefficients (K, L, 1) for L batch elements; other effects are ignored.
     """
     elements_by_joint: dict[str, list[SeriesElement]] = {}
     for effect, c in acting:
@@ -196,17 +195,15 @@ def write_series_effects(
 
 
 def make_series_element(kind: type[Effect], numbers: Mapping[str, Array]) -> SeriesElement:
-    """Make the series element of an effect from its coefficients (L,).
-
-    Shapes: L batch elements.
+    """Make the element in series with a joint, a spring or a gap, from an effect's coefficients.
 
     Args:
         kind: class of the effect.
-        numbers: coefficients by name; missing ones are zero.
+        numbers: coefficients (L,) of L batch elements by name; missing ones are zero.
     """
     assert issubclass(kind, HiddenStateEffect)
-    first = next(iter(numbers.values()))
-    values = [numbers.get(one.name, np.zeros_like(first)) for one in kind.between]
+    zeros = np.zeros_like(next(iter(numbers.values())))
+    values = [numbers.get(coefficient.name, zeros) for coefficient in kind.between]
     return kind().element(np.stack(values))
 
 
@@ -221,24 +218,30 @@ def write_series_element(
 ) -> None:
     """Write the numbers of the element between drive and links, of L batch elements, into fields.
 
-    With the deflection d between drive and links: a spring with a damper exerts -k d - c d' (3),
-    rigid flanks of a gap limit |d| to gap / 2 (4), and compliant flanks exert -k e - c d' with e
-    beyond the gap (5). In MuJoCo, the first is a joint stiffness and damping, and both flanks are
-    joint limits. The drive gets its share of the joint's inertia as armature. Stiffness and damping
-    are limited to what the time step can integrate.
+    Let d be the deflection between drive and links, the position of the joint that was added in
+    series. The element is one of these cases:
+
+    * A spring with a damper exerts -k d - c d' (3). It is the stiffness and damping of the joint.
+    * Rigid flanks of a gap limit |d| to gap / 2 (4). They are limits of the joint.
+    * Compliant flanks exert -k e - c d', where e is d beyond the gap (5). They are soft limits.
+
+    The drive gets its share of the joint's inertia as armature. Stiffness and damping are limited
+    to what the time step can integrate.
 
     Args:
-        fields: model fields of the batch elements.
+        fields: model fields of the batch elements, changed in place.
         robot: robot of `add_series_joints`.
-        place: joint with which they are in series.
-        element: the elements.
+        place: name of the joint of the drive.
+        element: numbers (L,) of the element.
     """
     second = robot.joint(find_series_joint(robot, place))
     inertia = robot.series[second.name]
+    # Inertia of the drive.
     dof = robot.joint(place).velocity
     file_armature = fields["dof_armature"][:, dof]
     drive = np.maximum(file_armature + element.drive * inertia, MIN_DRIVE_INERTIA_SHARE * inertia)
     fields["dof_armature"][:, dof] = drive
+    # Stiffness and damping of a spring, or of compliant flanks.
     option = robot.compiled.opt
     step = float(fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep)
     integrator = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
@@ -248,6 +251,7 @@ def write_series_element(
     is_compliant = is_compliant_flank(element)
     fields["jnt_stiffness"][:, second.id] = np.where(is_compliant, 0.0, stiffness)
     fields["dof_damping"][:, second.velocity] = np.where(is_compliant, 0.0, damping)
+    # Limits of flanks.
     if "jnt_range" in fields:
         half = 0.5 * element.gap
         fields["jnt_range"][:, second.id] = np.stack([-half, half], axis=1)
@@ -266,16 +270,16 @@ def is_compliant_flank(elements: SeriesElement) -> Flags:
 
 
 def convert_flank_parameters(fields: Mapping[str, Any], robot: RobotModel) -> None:
-    """Convert stiffness and damping of compliant flanks to parameters of MuJoCo's limit by (6).
+    """Convert stiffness and damping of compliant flanks to `solref` of MuJoCo's joint limit.
 
-    They are multiplied by the inverse inertia that MuJoCo has derived.
-
-    A limit of MuJoCo with impedance s exerts -(K e + C d') / (A + R), R = (1 - s) A0 / s (6), with
-    the excess e over the gap, the inverse inertia A along the joint, and A0 its value in the pose
-    of the file.
+    A limit with `solref` (-K s, -C s) and impedance s exerts -(K e + C d') / (A + R) with
+    R = (1 - s) A0 / s (6), where e is the deflection beyond the gap, A the inverse inertia along
+    the joint, and A0 its value in the pose of the file. At the small s that is used here, this is
+    -(K e + C d') s / A0. So stiffness and damping, which `write_series_element` has written, are
+    multiplied by A0, which MuJoCo has derived since.
 
     Args:
-        fields: model fields of the batch elements.
+        fields: model fields of the batch elements, changed in place.
         robot: robot of `add_series_joints`.
     """
     for name in robot.series:
@@ -293,16 +297,19 @@ def _compute_rigid_solref(step: float) -> tuple[float, float]:
 def prepare_flanks_for_file(
     robot: RobotModel, elements: Mapping[str, SeriesElement], model: Any = None
 ) -> RobotModel:
-    """Set the joint limits that represent flanks, for writing a model file.
+    """Set the limits of added joints that represent the flanks of gaps, for writing a model file.
 
     A gap is a joint limit of ± half its width. Limits must be set before the model is compiled,
-    and those of compliant flanks depend on the compiled inertia (6), so that the function is
-    called twice.
+    and those of compliant flanks depend on the compiled inertia (6). So with compliant flanks the
+    function is called again with the compiled model.
 
     Args:
         robot: robot of `add_series_joints`.
-        elements: elements of one batch element, by the joint with which they are in series.
+        elements: elements in series with joints, by the joint; numbers have the shape (1,).
         model: model compiled from the robot with all effects; required for compliant flanks.
+
+    Returns:
+        The robot with these limits.
     """
     spec, option = robot.spec.copy(), (model or robot.compiled).opt
     joints = {joint.name: joint for joint in spec.joints}
@@ -310,7 +317,7 @@ def prepare_flanks_for_file(
     for place, element in elements.items():
         joint = joints[find_series_joint(robot, place)]
         half = 0.5 * float(element.gap[0])
-        if not half:
+        if not half:  # a spring without a gap
             continue
         is_in_degrees = robot.joint(joint.name).kind == "hinge" and spec.compiler.degree
         half = float(np.rad2deg(half)) if is_in_degrees else half
@@ -319,33 +326,36 @@ def prepare_flanks_for_file(
         if model is not None and is_compliant_flank(element)[0]:
             inertia, drive = robot.series[joint.name], model.dof_armature
             drive = drive[[robot.joint(place).velocity]]
-            numbers = np.stack(_limit_to_stable_values(element, inertia, drive, step, explicit))[
-                :, 0
-            ]
+            (stiffness,), (damping,) = _limit_to_stable_values(
+                element, inertia, drive, step, explicit
+            )
             inverse = model.dof_invweight0[robot.joint(joint.name).velocity]
-            joint.solref_limit, joint.solimp_limit = (
-                -numbers * inverse,
-                COMPLIANT_FLANK_SOLIMP,
-            )  # (6)
+            joint.solref_limit = -np.array([stiffness, damping]) * inverse  # (6)
+            joint.solimp_limit = COMPLIANT_FLANK_SOLIMP
     return replace(robot, spec=spec)
 
 
 def _limit_to_stable_values(
     elements: SeriesElement, inertia: float, drive: Array, step: float, explicit: bool
 ) -> tuple[Array, Array]:
-    """Limit stiffness and damping (L,) to values that are stable for a time step.
+    """Return stiffness and damping (L,) of elements, limited to what is stable for a time step.
 
-    The oscillation between drive and links may advance by at most `MAX_PHASE` radians per step. If
-    damping is integrated implicitly, stiffness beyond this limit is replaced by damping.
+    The oscillation between drive and links may advance by at most `MAX_PHASE` radians per step,
+    which limits the stiffness; damping has a similar limit. The cases are:
 
-    Shapes: L batch elements.
+    * If the integrator treats damping explicitly (Runge-Kutta 4), both limits apply.
+    * Otherwise both limits apply to compliant flanks, whose limit of MuJoCo is explicit.
+    * A spring of a joint keeps its stiffness, and gets more damping in its place.
 
     Args:
-        elements: elements in series.
-        inertia: inertia of the joint.
+        elements: elements (L,) in series; their damping is a damping ratio.
+        inertia: inertia of the joint in kg m^2 or kg.
         drive: (L,) inertia of the drive.
         step: time step in seconds.
-        explicit: whether the integrator treats damping explicitly (Runge-Kutta 4).
+        explicit: whether the integrator treats damping explicitly.
+
+    Returns:
+        Stiffness in N m/rad or N/m, and damping in N m s/rad or N s/m.
     """
     inverse_inertia = 1.0 / drive + 1.0 / inertia
     max_stiffness = ((MAX_PHASE_RK4 if explicit else MAX_PHASE) / step) ** 2 / inverse_inertia
@@ -354,7 +364,8 @@ def _limit_to_stable_values(
     stable_damping = np.minimum(damping, MAX_PHASE / step / inverse_inertia)
     if explicit:
         return stiffness, stable_damping
-    # If damping is implicit, so is this stiffness, by the backward Euler rule: k (d + h d').
+    # Implicit damping makes a spring implicit, too, by the backward Euler rule k (d + h d'): the
+    # stiffness beyond the limit, times h, is added to the damping.
     is_compliant = is_compliant_flank(elements)
     implicit_damping = damping + step * (elements.stiffness - stiffness)
     return np.where(is_compliant, stiffness, elements.stiffness), np.where(
@@ -368,14 +379,15 @@ def compute_rest_positions(
     """Compute the rest positions (n,) of joints in series while their drives are held.
 
     They are the first states of links behind flexible or slack drives, which recordings do not
-    contain. The load, such as gravity, deflects a spring by load / stiffness. In a gap it moves the
-    links to the flank in its direction, or leaves them between the flanks if it is very small. The
-    stiffness of compliant flanks is read back from the parameters of MuJoCo's limit (6).
+    contain. A load, such as gravity, deflects a spring by load / stiffness. In a gap it moves the
+    links to the flank in its direction, or leaves them between the flanks if it is very small;
+    compliant flanks are deflected, too. Their stiffness is read back from the parameters of
+    MuJoCo's limit (6).
 
     Args:
         fields: model fields of the batch elements.
         robot: robot of `add_series_joints`.
-        loads: (n,) load at each of these joints.
+        loads: load (n,) in N m or N at each of these joints, for the first n batch elements.
     """
     positions = []
     for (name, inertia), load in zip(robot.series.items(), loads, strict=True):
@@ -386,7 +398,7 @@ def compute_rest_positions(
         effective_stiffness = np.where(
             is_compliant, -fields["jnt_solref"][:n, second.id, 0] / inverse, stiffness
         )  # (6)
-        half = fields["jnt_range"][:n, second.id, 1]
+        half = fields["jnt_range"][:n, second.id, 1]  # half the gap
         on_flank = half * np.clip(load / (UNLOADED_FORCE_SHARE * inertia), -1.0, 1.0)
         deflection = np.where(
             effective_stiffness > 0, load / np.maximum(effective_stiffness, 1e-300), 0.0

@@ -56,8 +56,9 @@ def find_stiff_force_limits(model: Any) -> ForceLimits:
 
     kinds = mujoco.mjtIntegrator
     implicit = (int(kinds.mjINT_IMPLICIT), int(kinds.mjINT_IMPLICITFAST))
-    # Degree of freedom, output (field and column), limit in its units, and limit at the joint.
-    force_limits: list[tuple[int, tuple[str, int], float, float]] = []
+    outputs: list[tuple[str, int]] = []  # field of MuJoCo's data and column
+    limits: list[float] = []  # in units of the field
+    joint_limits: list[tuple[int, float]] = []  # degree of freedom, and limit of its force
     gains = np.zeros(model.nv)
     if model.opt.integrator in implicit:
         for actuator_id in range(model.nu):
@@ -69,27 +70,29 @@ def find_stiff_force_limits(model: Any) -> ForceLimits:
             gain = -float(model.actuator_biasprm[actuator_id, 2]) * gear**2
             gains[dof] += gain
             if model.actuator_forcelimited[actuator_id] and _is_stiff(model, dof, gain):
-                limit = float(np.abs(model.actuator_forcerange[actuator_id]).max())
-                force_limits.append((dof, ("actuator_force", actuator_id), limit, limit * gear))
+                outputs.append(("actuator_force", actuator_id))
+                limits.append(float(np.abs(model.actuator_forcerange[actuator_id]).max()))
+                joint_limits.append((dof, limits[-1] * gear))
         for joint in np.flatnonzero(model.jnt_actfrclimited).tolist():
             dof = int(model.jnt_dofadr[joint])
             if _is_stiff(model, dof, float(gains[dof])):
-                limit = float(np.abs(model.jnt_actfrcrange[joint]).max())
-                force_limits.append((dof, ("qfrc_actuator", dof), limit, limit))
-    jumps = [_compute_jump(model, dof, force, gains) for dof, *_, force in force_limits]
+                outputs.append(("qfrc_actuator", dof))
+                limits.append(float(np.abs(model.jnt_actfrcrange[joint]).max()))
+                joint_limits.append((dof, limits[-1]))
+    # The gains of all servos must be known first.
+    jumps = [_compute_jump(model, dof, force, gains) for dof, force in joint_limits]
     return ForceLimits(
-        tuple(output for _, output, *_ in force_limits),
-        NEAR_LIMIT_SHARE * np.array([limit for *_, limit, _ in force_limits]),
-        np.array(jumps).reshape(-1, model.nv),
+        tuple(outputs), NEAR_LIMIT_SHARE * np.array(limits), np.array(jumps).reshape(-1, model.nv)
     )
 
 
 def _compute_jump(model: Any, dof: int, force: float, gains: Array) -> Array:
-    """Compute the jump of all positions (nv,) in a step in which one servo is at its force limit.
+    """Compute how far positions (nv,) jump in a step in which one servo is at its force limit.
 
-    A force f changes the velocity by h f / (M + h kv) in a step h, with the inertia M and the
-    servos' velocity gains kv. The jump is the difference between this with and without the gain of
-    the limited servo, times h. The servos of the other joints are taken as not limited.
+    Forces f change the velocity by (M + h diag(kv))^-1 h f in a step h, with the inertia matrix M
+    and the servos' velocity gains kv, which MuJoCo's implicit integrators treat implicitly. At its
+    limit a servo loses its gain. The jump is the difference of both velocities, times h, without
+    its sign. The servos of the other joints are taken as not limited.
 
     Args:
         model: the mujoco.MjModel.

@@ -55,8 +55,12 @@ def step_with_forces(
 ) -> dict[str, Array]:
     """Step n batch elements S times with effects that are evaluated in every step.
 
-    Before the steps, the solver parameters of dry friction of effects are set, and MuJoCo evaluates
-    the initial state with the first controls.
+    1. Set the solver parameters of dry friction of effects.
+    2. If possible, let MuJoCo call the compiled program of the effects (a callback) within all
+       steps.
+    3. Otherwise let MuJoCo make one step at a time, and evaluate the effects before it.
+
+    In both cases MuJoCo evaluates the initial state with the first controls before the first step.
 
     Args:
         mujoco_batch: the batch, with initial states and effects in its model.
@@ -69,6 +73,7 @@ def step_with_forces(
     Returns:
         Recorded fields (n, S, ...) by name.
     """
+    # 1. Dry friction.
     n, has_friction = len(controls), step_forces.has_dry_friction
     positions, dofs = step_forces.addresses.positions, step_forces.addresses.velocities
     file_friction = mujoco_batch.fields["dof_frictionloss"][:n, dofs].copy()
@@ -79,6 +84,7 @@ def step_with_forces(
     # This precedes MuJoCo's first evaluation, since fields that are bound later would not contain
     # it.
     predictor = MidpointPredictor(mujoco_batch.batch, positions, dofs, step_forces.loaded)
+    # 2. Callback.
     callback = find_callback(mujoco_batch, step_forces)
     if callback is not None:
         ctrl[:n] = controls[:, 0]
@@ -89,13 +95,15 @@ def step_with_forces(
             return mujoco_batch.step(
                 controls, forces, record, before_call=contexts.reset_accelerations
             )
+    # 3. Single steps.
     loss = mujoco_batch.fields["dof_frictionloss"]
     all_forces = forces.copy()
+    # Where a control changes, or an actuator is switched, at the beginning of a step (n, S).
     changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
     changes[:, [stretch.start for stretch in iterate_constant_stretches(off)]] = True
 
     def set_forces(k: int) -> None:
-        """Evaluate the effects at the predicted middle of step k, and set their forces."""
+        """Evaluate the effects at the predicted middle of step k, and add their forces to it."""
         ctrl[:n] = controls[:, k]
         if k == 0:
             mujoco_batch.batch.forward(mujoco_batch.get_element_ids(n))
@@ -108,7 +116,9 @@ def step_with_forces(
 
 
 def find_callback(mujoco_batch: MujocoBatch, step_forces: StepForces) -> Any:
-    """Return the compiled callback; None if it cannot compute these forces.
+    """Return the compiled callback that computes effect forces within MuJoCo's steps.
+
+    The result is None if it cannot compute these forces in this batch, or is not available.
 
     Args:
         mujoco_batch: the batch.
@@ -118,9 +128,10 @@ def find_callback(mujoco_batch: MujocoBatch, step_forces: StepForces) -> Any:
 
     disable = mujoco.mjtDisableBit
     required_parts = int(disable.mjDSBL_ACTUATION) | int(disable.mjDSBL_FRICTIONLOSS)
-    # Loads of transmissions require evaluations within a step. MuJoCo must compute actuators, in
-    # which it calls the callback, and dry friction. A callback that the user has set is not
-    # replaced.
+    # The callback is impossible with effects that are not compiled, with switched servos, and with
+    # loads of transmissions, which require evaluations within a step. MuJoCo must compute
+    # actuators, in which it calls the callback, and dry friction. A callback that the user has set
+    # is not replaced.
     if (
         not step_forces.prepared.program.is_traced
         or step_forces.depends_on_switches
@@ -140,17 +151,14 @@ class _CallbackContexts:
     ) -> None:
         """Write one context for each batch element: addresses and sizes for the compiled callback.
 
-        The table of contexts has one row of 64-bit integers for each element. Arrays in `shared`
-        are common to all elements, and those in `element_arrays` belong to one. `self._arrays`
-        keeps all of them alive, because the callback knows only their addresses. The callback finds
-        its row by the first number of an element in MuJoCo's user data.
-
-        Shapes: D joints.
+        The table of contexts has one row of 64-bit integers for each element. It has the addresses
+        of arrays: some are common to all elements (`shared`), others belong to one. The callback
+        finds its row by the first number of an element in MuJoCo's user data.
 
         Args:
             mujoco_batch: the batch.
             step_forces: effects, with the hidden states of the beginning.
-            losses: (n, D) dry friction of the model without effects.
+            losses: (n, D) dry friction of the model at the D joints without effects.
             steps: number of steps S.
         """
         self._mujoco_batch = mujoco_batch
@@ -167,6 +175,7 @@ class _CallbackContexts:
             "velocities": self._dofs.astype(np.int64),
             "step": np.array([step_forces.step]),
         }
+        # Keeps all arrays alive, because the callback knows only their addresses.
         self._arrays = list(shared.values())
         self._registers: list[Array] = []
         self._acceleration_registers = slice(layout.a, layout.a + joints)
@@ -175,9 +184,9 @@ class _CallbackContexts:
         has_friction = step_forces.has_dry_friction
         if has_friction.any():
             # MuJoCo makes a constraint only where the model has dry friction.
-            batch_indices, places = np.nonzero(has_friction)
+            batch_indices, joint_indices = np.nonzero(has_friction)
             loss = mujoco_batch.fields["dof_frictionloss"]
-            dofs = self._dofs[places]
+            dofs = self._dofs[joint_indices]
             loss[batch_indices, dofs] = np.maximum(loss[batch_indices, dofs], MIN_FRICTION)
             friction_rows = (loss > 0).sum(axis=1).tolist()
         else:
@@ -219,12 +228,16 @@ class _CallbackContexts:
 
     @contextlib.contextmanager
     def use(self, callback: Any) -> Iterator[None]:
-        """Have MuJoCo call the callback with these contexts in a `with` block."""
+        """Have MuJoCo call the callback with these contexts in a `with` block.
+
+        The address of an element's context is stored in its user data.
+        """
         import mujoco
 
         user = self._mujoco_batch.batch.bind("userdata")
-        row = self._table.strides[0]
-        user[: len(self._table), 0] = self._table.ctypes.data + row * np.arange(len(self._table))
+        row_bytes, _ = self._table.strides
+        rows = np.arange(len(self._table))
+        user[: rows.size, 0] = self._table.ctypes.data + row_bytes * rows
         mujoco.set_mjcb_control(callback)
         try:
             yield
@@ -239,8 +252,8 @@ class _CallbackContexts:
         may not keep it between two calls, so it is copied to the registers here.
 
         Args:
-            first: number of the first step of the call. The initial acceleration lacks the applied
-                forces, so it is not used.
+            first: number of the first step of the call. Before step 0 the acceleration is set to
+                zero, because MuJoCo's initial one lacks the applied forces.
         """
         self._table[:, HAS_ACCELERATION] = 0
         for batch_index, registers in enumerate(self._registers):

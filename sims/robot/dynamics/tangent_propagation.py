@@ -91,12 +91,14 @@ def replace_diverging_points(quotients: DifferenceQuotients) -> DifferenceQuotie
     Where a contact begins or ends within a finite difference, the difference quotient is a jump
     divided by the difference: it multiplies deviations by hundreds, although the real change is
     small, and a filter could not follow. Points with unusually large derivatives are suspects; they
-    are replaced if a deviation would grow by more than `MAX_STEP_GROWTH` in one step.
+    are replaced if a deviation would grow by more than `MAX_STEP_GROWTH` in one step. If all points
+    diverge, nothing is replaced.
 
     Args:
         quotients: the quotients at all points, in the order of time.
     """
     largest = np.abs(quotients.states).max(axis=(1, 2), initial=0.0)
+    # The comparison is false for NaN, so these points are suspects, too.
     suspects = np.flatnonzero(~(largest <= SUSPECT_RATIO * np.median(largest)))
     diverges = np.zeros(largest.size, dtype=bool)
     for point in suspects.tolist():
@@ -146,22 +148,20 @@ class TangentModel:
     def __init__(
         self, at: LinearisationPoints, sizes: Array, quotients: DifferenceQuotients | None = None
     ) -> None:
-        """Compute the difference quotients if none fit.
-
-        `self._share` (S,) is the time from its linearisation point to each step, as a share of the
-        regular distance between points. `self._earlier` and `self._later` (S,) are the indices of
-        the points between which the quotients of each step are interpolated.
-
-        Shapes: S steps.
+        """Prepare the interpolation between points, and compute the difference quotients if needed.
 
         Args:
             at: linearisation points of the motion.
-            sizes: (E,) typical forces.
-            quotients: difference quotients of another motion nearby; computed for this one if None.
+            sizes: (E,) typical forces in N or N m, which set the finite differences of forces.
+            quotients: difference quotients of another motion nearby, to be used for this one;
+                computed if None, or if they belong to other points.
         """
         self._at, self._motion = at, at.motion
         self._sizes = sizes
         self._steps = len(at.motion.controls)
+        # Time (S,) from its linearisation point to each of the S steps, as a share of the regular
+        # distance between points; and the indices (S,) of the points between which changes at
+        # points are interpolated to each step.
         numbers = np.arange(self._steps)
         self._share: Array = (numbers - at.point_steps[at.point_of_step]) / at.point_spacing
         self._earlier, self._later = _find_neighbours(at.point_steps, at.point_spacing)[
@@ -180,9 +180,9 @@ class TangentModel:
 
     @property
     def _base_readings(self) -> Array:
-        return (
-            self._base_accelerations if self._at.steps_joints_by_runge_kutta else self._base_step
-        )[1]
+        at_points = self._at.steps_joints_by_runge_kutta
+        _, readings = self._base_accelerations if at_points else self._base_step
+        return readings
 
     @cached_property
     def _base_accelerations(self) -> tuple[Array, Array]:
@@ -210,56 +210,59 @@ class TangentModel:
     def _compute_difference_quotients(self) -> DifferenceQuotients:
         """Compute the derivatives of a step by states, forces and controls at all points.
 
-        They are forward differences (1) of the state after a step. For the Runge-Kutta method, the
-        accelerations are differentiated instead, and (3) gives the derivatives of the step. With
-        contacts, which may begin or end within a difference, derivatives by positions are the
-        smaller ones of forward and backward differences.
-
-        `displacements` lists the displacements as (quantity, index, size), for states "z", forces
-        "f" and controls "u". The quantities are q position, v velocity, a activation, w hidden
-        state of an effect, p and r displacement and velocity of floating bodies, f force, u
-        control.
+        1. List the displacements of states, forces and controls.
+        2. Compute forward differences (1) of the state after a step. For the Runge-Kutta method,
+           differentiate the accelerations instead. With contacts, which may begin or end within a
+           difference, take the smaller ones of forward and backward differences by positions.
+        3. For the Runge-Kutta method, compute the derivatives of the step from those of the
+           accelerations (3).
         """
+        # 1. Displacements as quantity, index and size. The quantities are q position, v velocity,
+        # a activation, w hidden state of an effect, p and r displacement and velocity of floating
+        # bodies, f force, u control.
         joint_count = self._motion.x.shape[1]
         floating_count = self._sizes.size - joint_count
         na, nu = self._motion.act.shape[1], self._motion.controls.shape[1]
         displacements: dict[str, list[tuple[str, int, float]]] = {
-            "z": [("q", j, POSITION_DIFFERENCE) for j in range(joint_count)]
+            "state": [("q", j, POSITION_DIFFERENCE) for j in range(joint_count)]
             + [("v", j, VELOCITY_DIFFERENCE) for j in range(joint_count)]
             + [("a", j, CONTROL_DIFFERENCE) for j in range(na)]
             + [("w", k, CONTROL_DIFFERENCE) for k in self._at.hidden_state_effects]
             + [("p", j, POSITION_DIFFERENCE) for j in range(floating_count)]
             + [("r", j, VELOCITY_DIFFERENCE) for j in range(floating_count)],
-            "f": [
+            "force": [
                 ("f", j, FORCE_DIFFERENCE_SHARE * float(self._sizes[j]))
                 for j in range(joint_count + floating_count)
             ],
-            "u": [("u", j, CONTROL_DIFFERENCE) for j in range(nu)],
+            "control": [("u", j, CONTROL_DIFFERENCE) for j in range(nu)],
         }
+        # 2. Differences.
         if self._at.steps_joints_by_runge_kutta:
-            displaced = partial(self._at.compute_accelerations, self._at.acting, at_centres=True)
-            unchanged_states, unchanged_readings = displaced()
+            evaluate = partial(self._at.compute_accelerations, self._at.acting, at_centres=True)
+            unchanged_results, unchanged_readings = evaluate()
         else:
-            displaced = partial(self._at.step_displaced, acting=self._at.acting)
-            unchanged_states, unchanged_readings = self._base_step
+            evaluate = partial(self._at.step_displaced, acting=self._at.acting)
+            unchanged_results, unchanged_readings = self._base_step
         quotients: list[tuple[Array, Array]] = []
-        for kind in ("z", "f", "u"):
-            changes = np.zeros((*unchanged_states.shape, len(displacements[kind])))
-            readings = np.zeros((*unchanged_readings.shape, len(displacements[kind])))
-            for column, (name, j, difference) in enumerate(displacements[kind]):
-                changed, read = displaced(moved={name: (j, difference)})
-                changes[:, :, column] = (changed - unchanged_states) / difference
-                readings[:, :, column] = (read - unchanged_readings) / difference
+        for group in displacements.values():
+            derivatives = np.zeros((*unchanged_results.shape, len(group)))
+            reading_derivatives = np.zeros((*unchanged_readings.shape, len(group)))
+            for column, (name, j, difference) in enumerate(group):
+                results, readings = evaluate(moved={name: (j, difference)})
+                forward = (results - unchanged_results) / difference
+                derivatives[:, :, column] = forward
+                reading_derivatives[:, :, column] = (readings - unchanged_readings) / difference
                 if name == "q" and self._at.has_contacts:
                     # The force of a contact that begins or ends within the difference jumps.
-                    changed, read = displaced(moved={name: (j, -difference)})
-                    backward = (unchanged_states - changed) / difference
-                    is_smaller = np.abs(backward).max(1) < np.abs(changes[:, :, column]).max(1)
-                    changes[is_smaller, :, column] = backward[is_smaller]
-                    reading_rates = (unchanged_readings - read) / difference
-                    readings[is_smaller, :, column] = reading_rates[is_smaller]
-            quotients.append((changes, readings))
+                    results, readings = evaluate(moved={name: (j, -difference)})
+                    backward = (unchanged_results - results) / difference
+                    is_smaller = np.abs(backward).max(1) < np.abs(forward).max(1)
+                    derivatives[is_smaller, :, column] = backward[is_smaller]
+                    backward_readings = (unchanged_readings - readings) / difference
+                    reading_derivatives[is_smaller, :, column] = backward_readings[is_smaller]
+            quotients.append((derivatives, reading_derivatives))
         (by_state, by_force, by_control), of_readings = zip(*quotients, strict=True)
+        # 3. Derivatives of a Runge-Kutta step.
         if self._at.steps_joints_by_runge_kutta:
             by_state, by_force, by_control = compute_runge_kutta_step(
                 by_state, by_force, by_control, self._motion.step
@@ -273,18 +276,19 @@ class TangentModel:
     def perturb_model_numbers(
         self, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
     ) -> tuple[Array, Array]:
-        """Return the perturbation by other model parameters, such as a mass, per unit of `change`.
+        """Return the perturbation by other model parameters, such as a mass.
 
-        It consists of equivalent forces (N, E), and of direct changes of readings (N, O).
-
-        The accelerations at the points of the motion are computed with the changed model. A change
-        da of the acceleration at the same state acts like the force M da, with the inertia matrix
-        M, and is propagated like a force.
+        The accelerations at the N points of the motion are computed with the changed model. A
+        change da of the acceleration at the same state acts like the force M da, with the inertia
+        matrix M, and is propagated like a force.
 
         Args:
             acting: active effects including the one that changes the parameters.
-            change: size of the change.
+            change: size of the change, as a share of the effect's coefficients.
             mujoco_batch: batch whose model has the required elements.
+
+        Returns:
+            Equivalent forces (N, E) and direct changes of readings (N, O), divided by `change`.
         """
         if self._at.has_contacts and not self._at.steps_joints_by_runge_kutta:
             return self._perturb_numbers_at_contacts(acting, change, mujoco_batch)
@@ -295,10 +299,10 @@ class TangentModel:
             # computed without these forces.
             if self._at.reads_others:
                 _, readings = self._at.compute_accelerations(acting)
-        # A change of the acceleration is equivalent to a force.
         difference = (accelerations - self._accelerations_with_mean_forces) / change
         force = np.einsum("nij,nj->ni", self._mass_matrices, difference)
-        return force, (readings - self._base_accelerations[1]) / change
+        _, base_readings = self._base_accelerations
+        return force, (readings - base_readings) / change
 
     def _perturb_numbers_at_contacts(
         self, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
@@ -312,7 +316,8 @@ class TangentModel:
         with self._at.with_batch(mujoco_batch):
             ends, readings = self._at.step_displaced({}, acting)
         velocities = slice(self._sizes.size, 2 * self._sizes.size)
-        difference = (ends - self._base_step[0])[:, velocities] / change
+        base_ends, _ = self._base_step
+        difference = (ends - base_ends)[:, velocities] / change
         derivatives = self.quotients.forces[:, velocities]
         force: Array = np.linalg.solve(derivatives, difference[..., None])[..., 0].astype(
             np.float64
@@ -326,7 +331,8 @@ class TangentModel:
         They represent the damping of an implicit integrator, and the motion of other joints within
         the step.
         """
-        difference = self.accelerations[self._at.point_steps] - self._base_accelerations[0]
+        base_accelerations, _ = self._base_accelerations
+        difference = self.accelerations[self._at.point_steps] - base_accelerations
         forces: Array = np.einsum("nij,nj->ni", self._mass_matrices, difference)
         return forces
 
@@ -338,25 +344,26 @@ class TangentModel:
         part of these forces. A difference from the mean accelerations would be a jump there, which
         does not depend on the change of the model.
         """
-        return self._at.compute_accelerations(self._at.acting, self._mean_acceleration_forces)[0]
+        accelerations, _ = self._at.compute_accelerations(
+            self._at.acting, self._mean_acceleration_forces
+        )
+        return accelerations
 
     def perturb_by_force(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
-        """Return the changes by an effect's force, one for each joint that it acts on.
+        """Return the perturbations by an effect's force, one for each joint that it acts on.
 
         A force within a drive changes what the sensors of the drives read, too; this is one more
         perturbation.
-
-        Shapes: K coefficients.
 
         Args:
             owner: number of the effect candidate.
             effect: effect with a force.
             c: coefficients (K, 1, 1).
         """
-        force = self._at.compute_effect_force(effect, c)
+        forces = self._at.compute_effect_force(effect, c)
         changes = [
             Perturbation(owner, joint=joint, series=series)
-            for joint, series in enumerate(force.T)
+            for joint, series in enumerate(forces.T)
             if np.abs(series).max() > 0
         ]
         if is_in_drive(effect) and self._at.reads_drives:
@@ -374,7 +381,7 @@ class TangentModel:
 
     @cached_property
     def accelerations(self) -> Array:
-        """Mean accelerations (S, E) over each step, from the velocities at its ends."""
+        """Mean accelerations (S, E) over each of S steps, from the velocities at its ends."""
         motion = self._motion
         result: Array = np.diff(motion.velocities, axis=0)[: self._steps] / motion.step
         return result
@@ -391,15 +398,14 @@ class TangentModel:
         the candidate effect to which a change belongs; all n owners are propagated in one matrix
         product per step.
 
-        Shapes: S steps, Z state components, O readings.
-
         Args:
             changes: changes with owners from 0 to `count` - 1.
             count: number of owners n.
             initial: (Z, n) changes of the initial state; none by default.
 
         Returns:
-            Changes of states (n, S + 1, Z) and of readings (n, S, O).
+            Changes of states (n, S + 1, Z), with Z components at the beginnings of S steps and at
+            the end, and of O readings (n, S, O) at the beginnings.
         """
         quotients = self.quotients
         state_size = quotients.forces.shape[1]
@@ -436,14 +442,14 @@ class TangentModel:
         changes. It shows the command at the beginning of a step, while the mean over the step moves
         the robot.
 
-        Shapes: S steps, O readings, E forces, nu controls.
-
         Args:
-            changes: changes with owners from 0 to `count` - 1.
+            changes: changes with owners from 0 to `count` - 1; an owner is the candidate effect to
+                which a change belongs.
             count: number of owners n.
 
         Returns:
-            Forces and controls (S, E + nu, n); readings (S, O, n) at unchanged states.
+            Changes (S, E + nu, n) of E forces and nu controls in S steps; and changes (S, O, n) of
+            O readings at unchanged states.
         """
         quotients = self.quotients
         force_count = quotients.forces.shape[2]
@@ -456,6 +462,7 @@ class TangentModel:
             np.zeros((control_count, count, steps)) if reading_count else inputs[force_count:]
         )
         readings = np.zeros((steps, reading_count, count))
+        # 1. Series of forces and controls, and readings that a change states itself.
         for change in changes:
             owner = change.owner
             if change.joint >= 0 and change.series is not None:
@@ -470,6 +477,7 @@ class TangentModel:
             if change.readings is not None:
                 readings[:, :, owner] += self._interpolate_to_steps(change.readings)
         stepwise_inputs = np.ascontiguousarray(inputs.transpose(2, 0, 1))
+        # 2. Readings that follow from forces and controls.
         if reading_count:
             forces = stepwise_inputs[:, :force_count].copy()
             # Changes of model parameters already contain their effect on readings.
@@ -491,18 +499,12 @@ class TangentModel:
 
     @property
     def motion_readings(self) -> Array:
-        """Readings (S, O) of the motion at the beginnings of steps, as computed by the model.
-
-        Shapes: S steps.
-
-        Returns:
-            (S, O) values of O sensor outputs, with the command of that time instead of the step's
-            mean.
-        """
+        """Readings (S, O) of O outputs at the beginnings of S steps, as computed by the model."""
         motion, points = self._motion, self._at.point_of_step
         with self._at.at_steps(np.arange(self._steps)):
             _, step_readings = self._at.compute_accelerations(self._at.acting)
-        # A step applies the mean of a command, while a sensor shows its value at the beginning.
+        # The model was evaluated with the mean of a command over the step, while a sensor shows its
+        # value at the beginning.
         difference = motion.instant - motion.controls
         result: Array = step_readings + np.einsum(
             "sou,su->so", self.quotients.read_controls[points], difference
@@ -510,49 +512,57 @@ class TangentModel:
         return result
 
     def step_errors(self, finer: MujocoBatch) -> Array:
-        """Estimate the discretisation error of a step, (N, Z), by Richardson extrapolation.
+        """Estimate the discretisation error of a step by Richardson extrapolation.
 
-        Two steps of half the length leave half the error of one step of a method of first order (L.
-        F. Richardson, 1911, doi:10.1098/rsta.1911.0009).
+        Two steps of half the length have half the error of one step of a method of first order, so
+        twice the difference leads to the exact state (L. F. Richardson, 1911,
+        doi:10.1098/rsta.1911.0009).
 
         Args:
             finer: batch with half the time step.
+
+        Returns:
+            (N, Z) exact minus computed state after a step from each point.
         """
         with self._at.with_batch(finer):
-            state, _ = self._at.step_displaced({}, self._at.acting, steps=2)
-        return 2.0 * (state - self._base_step[0])
+            finer_state, _ = self._at.step_displaced({}, self._at.acting, steps=2)
+        state, _ = self._base_step
+        return 2.0 * (finer_state - state)
 
     @cached_property
     def defects(self) -> Array:
         """Differences (S, Z) between the motion and the model's own step, the defect of each step.
 
         The model starts each step from the state of the motion. The defect is zero for a
-        simulated motion, and not zero for a measured one.
-
-        Shapes: S steps.
+        simulated motion, and not zero for a measured one. Only positions and velocities of joints
+        and floating bodies have defects.
         """
         motion, joints = self._motion, self._motion.x.shape[1]
         predicted_states, _ = self._every_step
         defects = np.zeros_like(predicted_states)
         defects[:, :joints] = motion.x[1:] - predicted_states[:, :joints]
         defects[:, joints : 2 * joints] = motion.v[1:] - predicted_states[:, joints : 2 * joints]
-        moves = motion.floating_state.rate.shape[1]
-        if moves:
-            # Displacements are relative to the motion itself.
-            defects[:, -2 * moves : -moves] = -predicted_states[:, -2 * moves : -moves]
-            defects[:, -moves:] = motion.floating_state.rate[1:] - predicted_states[:, -moves:]
+        floating = motion.floating_state.rate.shape[1]
+        if floating:
+            # The displacements and velocities of floating bodies come last. Predicted displacements
+            # are relative to the motion.
+            displacements, rates = np.split(predicted_states[:, -2 * floating :], 2, axis=1)
+            defects[:, -2 * floating : -floating] = -displacements
+            defects[:, -floating:] = motion.floating_state.rate[1:] - rates
         return defects
 
     def compute_defect_changes(self, similar: TangentModel) -> Array:
         """Compute how the defects (S, Z) differ from those of a model with other parameters.
 
-        One step in the middle of those that a linearisation point stands for represents them all,
-        unless commands differ too.
-
-        Shapes: S steps.
+        The defect is the difference between the motion and the model's own step, so it changes by
+        the difference of both steps. One step in the middle of those that a linearisation point
+        stands for represents them all, unless commands differ too.
 
         Args:
             similar: model of the same motion.
+
+        Returns:
+            The defects of this model minus those of the other one.
         """
         if not np.array_equal(self._motion.controls, similar._motion.controls):
             return self.defects - similar.defects
@@ -560,13 +570,15 @@ class TangentModel:
         middle = (self._at.point_steps + ends) // 2
         with self._at.at_steps(middle):
             states, _ = self._at.step_displaced({}, self._at.acting)
-        changes: Array = similar._every_step[0][middle] - states
+        similar_states, _ = similar._every_step
+        changes: Array = similar_states[middle] - states
         return changes[self._at.point_of_step]
 
     @property
     def limited_forces(self) -> Array:
         """Forces (S, K) with limits at stiff servos, in each step."""
-        return self._every_step[1]
+        _, limited_forces = self._every_step
+        return limited_forces
 
     @cached_property
     def _every_step(self) -> tuple[Array, Array]:
@@ -577,11 +589,10 @@ class TangentModel:
     def _interpolate_to_steps(self, values: Array) -> Array:
         """Interpolate values (N, k) at N linearisation points linearly to all S steps, (S, k).
 
-        A point lies at each change of a command and at regular distances after it. Values are
-        interpolated between two points of one command, between which the motion is smooth, and
-        extrapolated after the last of them. So each step has the value at its point plus `_share`
-        times the difference of two neighbouring points of the same command, `_earlier` and
-        `_later`.
+        A point lies at each change of a command and at regular distances after it. Between two
+        points of one command the motion is smooth, so values are interpolated there; after the last
+        point of a command, they are extrapolated. `_earlier` and `_later` (S,) are the two points
+        for each step, and `_share` (S,) is its distance from its own point, as a share of theirs.
         """
         slope = values[self._later] - values[self._earlier]
         result: Array = values[self._at.point_of_step] + self._share[:, None] * slope
@@ -590,19 +601,16 @@ class TangentModel:
     @staticmethod
     def _find_parameter_changes(changes: Sequence[Perturbation], count: int) -> Mask:
         """Return which of `count` owners change model parameters, as a mask (count,)."""
-        numbered = np.zeros(count, dtype=bool)
-        numbered[[change.owner for change in changes if change.forces is not None]] = True
-        return numbered
+        changes_parameters = np.zeros(count, dtype=bool)
+        changes_parameters[[change.owner for change in changes if change.forces is not None]] = True
+        return changes_parameters
 
     def propagate_initial_state(self) -> tuple[Array, Array]:
-        """Compute the responses to each initial position and velocity.
-
-        The first D changes are unit changes of the positions, the others those of the velocities.
-
-        Shapes: S steps.
+        """Compute the responses to unit changes of each initial position and velocity of a joint.
 
         Returns:
-            Changes of states (2 D, S + 1, Z) and of readings (2 D, S, O).
+            Changes of states (2 D, S + 1, Z) and of readings (2 D, S, O) over S steps: first by the
+            D positions, then by the D velocities.
         """
         count = 2 * self._motion.x.shape[1]
         return self.propagate((), count, np.eye(self.state_size, count))
@@ -617,10 +625,9 @@ def compute_runge_kutta_step(
     L = [[0], [da/df]]. Held constant in a step of length h, they give the derivatives A = I + P K
     by the state and B = P L by forces, with P = h I + h^2 K / 2 + h^3 K^2 / 6 + h^4 K^3 / 24 (3).
 
-    Shapes: N points, D joints, E forces, nu controls.
-
     Args:
-        by_state: (N, D, 2 D) derivatives of accelerations by positions and velocities.
+        by_state: (N, D, 2 D) derivatives of accelerations of D joints by positions and velocities,
+            at N points.
         by_force: (N, D, E) derivatives by forces.
         by_control: (N, D, nu) derivatives by controls.
         step: step length h in seconds.
@@ -629,25 +636,29 @@ def compute_runge_kutta_step(
         Derivatives (N, 2 D, 2 D), (N, 2 D, E) and (N, 2 D, nu) of the state after the step.
     """
     points, joints, size = by_state.shape
-    rates = np.zeros((points, size, size))
+    rates = np.zeros((points, size, size))  # K
     rates[:, :joints, joints:] = np.eye(joints)
     rates[:, joints:] = by_state
     scaled = step * rates
     unit = np.eye(size)
     propagator = step * (unit + scaled @ (unit / 2 + scaled @ (unit / 6 + scaled / 24)))
-    of_velocity = propagator[:, :, joints:]
+    of_velocity = propagator[:, :, joints:]  # L is zero for the positions
     return unit + propagator @ rates, of_velocity @ by_force, of_velocity @ by_control
 
 
 def _find_neighbours(point_steps: IndexArray, spacing: int) -> IndexArray:
-    """Find the pairs of linearisation points for interpolation, (2, N).
+    """Find the pairs of linearisation points for interpolation.
 
-    A pair is `spacing` steps apart: a point and the next one, or the previous one and the point if
-    a command changes in between. If neither exists, the point itself is given twice.
+    Two points that are not `spacing` steps apart belong to different commands, between which
+    nothing is interpolated. A point forms a pair with the next point of its command, or else with
+    the previous one. If neither exists, it forms a pair with itself.
 
     Args:
         point_steps: (N,) steps of the linearisation points.
         spacing: regular number of steps between two points.
+
+    Returns:
+        (2, N) indices of the earlier and the later point of each point's pair.
     """
     numbers = np.arange(point_steps.size)
     has_next = np.append(np.diff(point_steps) == spacing, False)

@@ -118,7 +118,7 @@ def test_a_move_and_the_way_back_agree():
     pose = rng.normal(size=(5, 7))
     pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     for number in range(6):
-        moves = floating.compute_displacement(floating.displace(pose, number, 0.3), pose)
+        moves = floating.compute_displacement(floating.displace_coordinate(pose, number, 0.3), pose)
         np.testing.assert_allclose(moves, 0.3 * np.eye(6)[[number] * 5], atol=1e-12)
 
 
