@@ -81,16 +81,18 @@ def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[st
 def _check_actuator_table(
     spec: Any, source: str, table_name: str, name: str, table: Mapping[str, Any]
 ) -> None:
-    """Check the table of an added actuator: its joint, kind, name and gains.
+    """Check the table of an added actuator.
 
-    The joint must have one degree of freedom, the kind determines the allowed gains, and the first
-    of these is required. `kp`, `ki` and `kv` are gains on position, integral and velocity; `kd`
-    acts on the rate of the error, and so excludes `kv`. Only the gear may be negative.
+    * It states a joint with one degree of freedom, and a kind.
+    * Its name is not that of another actuator.
+    * It has only the gains of its kind, and the first of these is required.
+    * Not both kd and kv are given: kd acts on the rate of the error, kv on that of the joint.
+    * Numbers are finite, and gains are not negative.
 
     Args:
         spec: editable MuJoCo model (`mujoco.MjSpec`) with the joints and actuators of the file.
-        source: beginning of error messages.
-        table_name: name of the table, for error messages.
+        source: beginning of error messages, the file.
+        table_name: name of the table in error messages, such as ``actuators.elbow``.
         name: name of the new actuator.
         table: entries of the table.
 
@@ -169,6 +171,14 @@ def _set_pid(actuator: Any, gains: dict[str, float], kd: float | None) -> None:
 
     With kd, a gain on the rate of the error, the actuator has two controls: the set point and
     its rate. MuJoCo then takes kd in place of kv.
+
+    Args:
+        actuator: actuator of a `mujoco.MjSpec`, changed in place.
+        gains: gains kp, ki and kv that are given; kd is added to it as kv.
+        kd: gain on the rate of the error; None if it is not given.
+
+    Raises:
+        InputError: this version of MuJoCo has no such actuator.
     """
     import mujoco
 

@@ -21,10 +21,12 @@ def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
     """Exclude contacts between bodies that overlap in the model file, but not in reality.
 
     Shapes of neighbouring links often overlap at their joint, and would push each other apart with
-    large forces. Excluded are contacts between the fixed base and the bodies attached to it, and
-    between bodies that overlap at the zero position by more than `OVERLAP_DEPTH`.
-    MuJoCo itself excludes contacts between a body and its parent, except if the parent is the
-    world; the root of a URDF is fused to the world.
+    large forces. Two kinds of contacts are excluded:
+
+    * Between the fixed base and the bodies attached to it. MuJoCo itself excludes contacts between
+      a body and its parent, except if the parent is the world, to which the root of a URDF is
+      fused.
+    * Between bodies that overlap at the zero position by more than `OVERLAP_DEPTH`.
 
     Args:
         spec: editable MuJoCo model (`mujoco.MjSpec`), changed in place.
@@ -35,7 +37,8 @@ def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
     """
     import mujoco
 
-    # MuJoCo's body 0 is the world, and so the fixed base. A geom of contact type 0 never collides.
+    # Children of the base with a geom that collides: its contact type is not 0. MuJoCo's body 0 is
+    # the world, and so the fixed base.
     colliding_bodies = {
         int(body)
         for body, contact_type in zip(model.geom_bodyid, model.geom_contype, strict=True)
@@ -46,13 +49,16 @@ def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
         base_children = [
             i for i in sorted(colliding_bodies) if i and int(model.body_parentid[i]) == 0
         ]
+    # Overlaps at the zero position.
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     overlapping_pairs = set()
     for contact in data.contact:
-        pair = tuple(sorted(int(model.geom_bodyid[geom]) for geom in contact.geom))
-        if contact.dist < -OVERLAP_DEPTH and not (pair[0] == 0 and pair[1] in base_children):
-            overlapping_pairs.add(pair)
+        first, second = sorted(int(model.geom_bodyid[geom]) for geom in contact.geom)
+        is_with_base = first == 0 and second in base_children
+        if contact.dist < -OVERLAP_DEPTH and not is_with_base:
+            overlapping_pairs.add((first, second))
+    # Exclusions and notes.
     names = [model.body(i).name for i in range(model.nbody)]
     for first, second in [*((0, i) for i in base_children), *sorted(overlapping_pairs)]:
         spec.add_exclude(bodyname1=names[first], bodyname2=names[second])
@@ -81,9 +87,11 @@ def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
     """Find the geoms (shapes) of a compiled model that can collide with another geom.
 
     All others can be left out to save memory. Pairs are filtered by MuJoCo's own rules (its
-    documentation, "Computation", collision detection): the bit masks contype and conaffinity of the
-    two geoms must match; their bodies must not be welded together, nor parent and child, nor
-    excluded by the file. Pairs that the file lists explicitly always collide.
+    documentation, "Computation", collision detection):
+
+    * The bit masks contype and conaffinity of the two geoms must match.
+    * Their bodies must not be welded together, nor parent and child, nor excluded by the file.
+    * Pairs that the file lists explicitly always collide.
 
     Args:
         model: the mujoco.MjModel, without flexes.
@@ -101,6 +109,7 @@ def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
     (body, contype, affinity), row_indices = np.unique(
         np.stack(geom_rows), axis=1, return_inverse=True
     )
+    # Matrices of all pairs of rows.
     masks = contype[:, None] & affinity
     can_collide = (masks | masks.T) != 0
     weld_ids = weld[body]
@@ -112,7 +121,7 @@ def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
             (parent_weld[:, None] == weld_ids) & (weld_ids != 0) & (weld_ids[:, None] != 0)
         )
         can_collide &= ~(is_parent_pair | is_parent_pair.T)
-    # MuJoCo writes an excluded pair of bodies as one number.
+    # MuJoCo stores an excluded pair of bodies as one number, the smaller body in the upper bits.
     first, second = np.minimum(body[:, None], body), np.maximum(body[:, None], body)
     can_collide &= ~np.isin((first << 16) + second, model.exclude_signature)
     result: NDArray[np.bool_] = can_collide.any(axis=1)[row_indices.reshape(-1)]

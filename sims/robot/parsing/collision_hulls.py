@@ -176,6 +176,11 @@ class CollisionShapes:
         """Read the data from the model with the whole meshes.
 
         They are rounded differently in a model that is compiled from hulls.
+
+        Args:
+            model: compiled model with the whole meshes.
+            hulls: hulls by name of the mesh.
+            geoms: numbers of the geoms that have such a mesh, by name.
         """
         fields = {
             name: {field: getattr(model, field)[i].copy() for field in DOUBLE_PRECISION_GEOM_FIELDS}
@@ -187,13 +192,13 @@ class CollisionShapes:
         )
 
     def write(self, model: Any) -> None:
-        """Write the data into a model with meshes of `add_hull` and `add_memory_reserve`.
+        """Write the data into a compiled model with meshes of `add_hull` and `add_memory_reserve`.
 
-        The stored hulls replace those that the compiler would compute from the meshes, which takes
-        long.
+        The original hulls, geom fields and bounds replace those of the compiler, which are rounded
+        differently.
 
         Args:
-            model: Compiled model of MuJoCo; changed in place.
+            model: compiled MuJoCo model (`mujoco.MjModel`); changed in place.
         """
         write_hulls(model, self.hulls)
         for name, fields in self.geoms.items():
@@ -217,9 +222,10 @@ def _get_bounding_volumes(model: Any, body: int) -> Array:
 def add_hull(spec: Any, name: str, hull: Hull) -> None:
     """Add a mesh with a hull's vertices to an editable model, so that compilation keeps them.
 
-    When MuJoCo compiles a mesh, it moves the vertices into the principal frame of the faces, which
-    would round them. So the only faces are those of a small box inside the hull, around its origin
-    and along its axes: its principal frame is the present one, and no vertex moves.
+    When MuJoCo compiles a mesh, it moves the vertices into the principal frame of the faces (that
+    of their inertia), which would round them. So the only faces are those of a small box around the
+    origin of the mesh and along its axes. The principal frame of the box is the frame of the mesh,
+    and no vertex moves.
 
     Args:
         spec: editable MuJoCo model (`mujoco.MjSpec`); it is changed in place.
@@ -244,8 +250,10 @@ def add_memory_reserve(spec: Any, model: Any, full_model: Any, hulls: Mapping[st
 
     MuJoCo allocates memory for the hulls that it computes when it compiles. These can be smaller
     than the original ones, which are written over them later. Two additional meshes reserve the
-    difference: a sphere with many vertices makes the arrays longer, and a pyramid, whose base has
-    many corners, makes the buffers for single polygons longer.
+    difference, where it is needed:
+
+    * A sphere with many vertices makes the arrays of all hulls longer.
+    * A pyramid, whose base has many corners, makes the buffers for single polygons longer.
 
     Args:
         spec: editable MuJoCo model with the meshes of `add_hull`; it is changed in place.
@@ -254,6 +262,7 @@ def add_memory_reserve(spec: Any, model: Any, full_model: Any, hulls: Mapping[st
         hulls: hulls by name of the mesh.
     """
     compiled_hulls = [read_hull(model, model.mesh(name).id) for name in hulls]
+    # Graph integers, polygons and polygon corners.
     missing_sizes = _count_hull_elements(hulls.values()) - _count_hull_elements(
         hull for hull in compiled_hulls if hull
     )
@@ -285,7 +294,8 @@ def _compute_rotations(angles: Array) -> Array:
 def has_large_enough_buffers(model: Any, full_model: Any) -> bool:
     """Return whether MuJoCo's contact buffers for a model are at least those for the whole meshes.
 
-    With smaller buffers MuJoCo would write beyond their ends.
+    The model's size fields ``n...max`` state them. With smaller buffers MuJoCo would write beyond
+    their ends.
 
     Args:
         model: model with hulls.
@@ -300,13 +310,14 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
 
     The compiler computes them from rounded vertices, so contacts would differ in their eighth
     digit. MuJoCo stores the hulls of all meshes one after another in common arrays, with the
-    address of each mesh. So all of them are written anew: first the graph, then the polygons, then
-    for each vertex the polygons around it. Meshes without a hull, and those that only reserve
-    memory, get the address -1 or no polygons.
+    address of each mesh. So all of them are written again, mesh after mesh: first the graph, then
+    the polygons, then for each vertex the polygons around it. Meshes without a hull, and those that
+    only reserve memory, get the address -1 for the graph, and no polygons.
 
     Args:
-        model: model compiled from a spec with meshes of `add_hull` and `add_memory_reserve`.
-        hulls: hulls by name of the mesh.
+        model: model compiled from a spec with meshes of `add_hull` and `add_memory_reserve`;
+            changed in place.
+        hulls: original hulls by name of the mesh; other meshes keep their own.
     """
     names = [model.mesh(i).name for i in range(model.nmesh)]
     # All hulls are read before the first is written, since they move within MuJoCo's arrays.
@@ -322,10 +333,12 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         model.mesh_polyadr[i], model.mesh_polynum[i] = polygon_end, 0
         if hull is None or name.startswith(RESERVE_PREFIX):
             continue
+        # Graph.
         model.mesh_graphadr[i] = graph_end
         model.mesh_extrema[i] = hull.extrema
         model.mesh_graph[graph_end : graph_end + hull.graph.size] = hull.graph
         graph_end += hull.graph.size
+        # Polygons.
         address_range = slice(polygon_end, polygon_end + hull.polygons.sizes.size)
         model.mesh_polynum[i] = hull.polygons.sizes.size
         model.mesh_polynormal[address_range] = hull.normals
@@ -335,6 +348,7 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
             model.mesh_polyvert, first_indices, counts, hull.polygons, corner_end
         )
         polygon_end = address_range.stop
+        # Polygons around each vertex; vertices that are not on the hull have none.
         first_vertex = int(model.mesh_vertadr[i])
         model.mesh_polymapnum[first_vertex : first_vertex + int(model.mesh_vertnum[i])] = 0
         address_range = slice(first_vertex, first_vertex + hull.around.sizes.size)
@@ -370,14 +384,17 @@ def _gather_lists(values: Integers, first_indices: Integers, sizes: Integers) ->
 def _write_lists(
     values: Integers, first_indices: Integers, sizes: Integers, lists: Lists, first: int
 ) -> int:
-    """Write lists one after another into an array of MuJoCo, and return the index after the last.
+    """Write lists one after another into an array of MuJoCo.
 
     Args:
         values: flat array, changed in place.
-        first_indices: index of the first entry of each list, set in place.
-        sizes: number of its entries, set in place.
-        lists: the lists.
-        first: index of the first entry of the first list.
+        first_indices: (n,) index of the first entry of each list, set in place.
+        sizes: (n,) number of its entries, set in place.
+        lists: the n lists.
+        first: index in `values` at which the first list begins.
+
+    Returns:
+        Index after the last entry.
     """
     list_ends = first + np.cumsum(lists.sizes)
     first_indices[:], sizes[:] = list_ends - lists.sizes, lists.sizes

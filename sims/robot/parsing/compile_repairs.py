@@ -49,8 +49,8 @@ class CompileRepairs:
     def compile(self, spec: Any) -> tuple[Any, Any]:
         """Compile an editable model, and repair what MuJoCo rejects.
 
-        MuJoCo reports one error at a time. So the model is compiled again after each repair;
-        the number of attempts is limited by two for each body and asset.
+        MuJoCo reports one error at a time. So the model is compiled again after each repair. The
+        number of attempts is limited to two for each body and asset, and two more.
 
         Args:
             spec: editable model (`mujoco.MjSpec`); it must not be used afterwards.
@@ -64,6 +64,7 @@ class CompileRepairs:
         """
         assets = (*spec.meshes, *spec.hfields, *spec.skins, *spec.textures)
         for _ in range(2 * (len(spec.bodies) + len(assets)) + 2):
+            # Only errors of the compiler are repaired; an `InputError` is already for the user.
             try:
                 uncompiled = spec.copy()
                 return uncompiled, spec.compile()
@@ -76,14 +77,21 @@ class CompileRepairs:
         raise self.files.make_mujoco_error(message)
 
     def _repair_named_element(self, spec: Any, message: str) -> bool:
-        """Repair the element that MuJoCo's message names, and return whether anything was changed.
+        """Repair the element that MuJoCo's message names.
 
-        The message is the only information about the reason, so its text is searched. False
-        means that it fits no known repair, and that the user must change the file.
+        The message is the only information about the reason, so its text is searched. The repairs
+        are:
+
+        * principal moments that violate the triangle inequality: replace them,
+        * a moving body without mass or inertia: give it a small one,
+        * a file that does not exist, or a mesh or texture that MuJoCo refuses: remove the asset.
 
         Args:
             spec: the model as an `MjSpec`, changed in place.
             message: message of MuJoCo's compiler.
+
+        Returns:
+            Whether anything was changed; otherwise the user must change the file.
         """
         name_match = re.search(r"Element name '(.*?)', id", message)
         name = name_match[1] if name_match else ""
@@ -126,9 +134,9 @@ class CompileRepairs:
     def _set_default_mass(self, spec: Any, name: str) -> bool:
         """Give a moving body the default mass and moments of inertia, where it has less.
 
-        MuJoCo refuses moving bodies without mass or inertia. A changed body is noted: in `massless`
-        if it had no mass, by whether other bodies are attached to it (without any, its joints have
-        little effect), otherwise in `slight`.
+        MuJoCo refuses moving bodies without mass or inertia. A changed body is noted: in `slight`
+        if it had a mass; otherwise in `massless`, by whether other bodies are attached to it
+        (without any, its joints have little effect).
 
         Args:
             spec: the model as an `MjSpec`, changed in place.
@@ -137,6 +145,7 @@ class CompileRepairs:
         Returns:
             Whether the body was changed.
         """
+        # Names are unique, so the list has at most one body.
         for body in [body for body in spec.bodies if body.name == name]:
             mass, (moments, axes) = float(np.nan_to_num(body.mass)), _get_principal_moments(body)
             is_too_light = mass < DEFAULT_BODY_MASS
@@ -156,7 +165,7 @@ class CompileRepairs:
 
     @property
     def notes(self) -> list[str]:
-        """Notes, one for each kind of repair."""
+        """Notes about omitted shapes, and one note for each kind of repair of bodies."""
         notes = self.left.notes
         if self.balanced:
             notes.append(

@@ -59,6 +59,8 @@ def rename_invalid_names(root: Element) -> list[str]:
 def name_unnamed_elements(spec: Any) -> list[str]:
     """Name unnamed joints, actuators, bodies and sensors of a spec by their numbers in the file.
 
+    Examples are ``joint3`` and ``body0``; underscores are added if another element has this name.
+
     Args:
         spec: the mujoco.MjSpec; it is changed in place.
 

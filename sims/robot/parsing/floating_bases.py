@@ -22,13 +22,14 @@ def separate_floating_joints(
 
     A quaternion is not a coordinate that can be recorded, varied or fitted like that of another
     joint. The new joints allow the same motion with such coordinates, which are those of
-    `sims.recording.recorded_poses`: slides along the axes of the world have the position of the
-    body in the world, and hinges about z, y and x are zero in the orientation of the file.
-    Keyframes (stored states) are left out, since they have the former coordinates.
+    `sims.recording.recorded_poses`: slides along the axes of the world (only for a free joint) have
+    the position of the body in the world, and hinges about z, y and x, in this order, are zero in
+    the orientation of the file. Keyframes (stored states) are left out, since they have the former
+    coordinates.
 
     Args:
         spec: a mujoco.MjSpec whose joints have names; it is changed in place.
-        bases: names of free or ball joints.
+        bases: names of free or ball joints whose pose is recorded.
         source: beginning of error messages.
 
     Returns:
@@ -42,7 +43,7 @@ def separate_floating_joints(
     kinds = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
     floating = {joint.name: joint for joint in spec.joints if joint.type in kinds}
     names = {joint.name for joint in spec.joints}
-    # Hinges may have such names in the file already.
+    # The file may have hinges with the names of the new ones already; these are kept.
     bases = [base for base in bases if base in floating or f"{base}.{ANGLES[0]}" not in names]
     if not bases:
         return (), []
@@ -54,6 +55,7 @@ def separate_floating_joints(
                 f"{make_unknown_name_error('floating joint', base, sorted(floating))}"
             )
         joint = floating[base]
+        # The new joints would have no such forces.
         stated = [
             name
             for name in ("damping", "armature", "frictionloss", "stiffness")
@@ -75,19 +77,21 @@ def separate_floating_joints(
         axes_in_body = rotation.reshape(3, 3).T
         spec.delete(joint)
         for k, name in enumerate(POSITION_AXES if is_free else ()):
-            _add_joint(
+            slide = _add_joint(
                 body, f"{base}.{name}", mujoco.mjtJoint.mjJNT_SLIDE, axes_in_body[:, k]
-            ).ref = float(compiled.pos[k])
-        for name, k in zip(ANGLES, (2, 1, 0), strict=True):
+            )
+            slide.ref = float(compiled.pos[k])
+        for k, name in zip((2, 1, 0), ANGLES, strict=True):
             hinge = _add_joint(
                 body, f"{base}.{name}", mujoco.mjtJoint.mjJNT_HINGE, axes_in_body[:, k]
             )
+            # A ball joint turns about its anchor, a free body about its origin.
             hinge.pos = np.zeros(3) if is_free else anchor
     return tuple(bases), [f"the pose is recorded: {', '.join(bases)}{remove_keyframes(spec)}"]
 
 
 def _add_joint(body: Any, name: str, kind: Any, axis: Any) -> Any:
-    """Add a joint without any force of its own, whatever the defaults of the file are.
+    """Add a joint without forces or limits of its own, whatever the defaults of the file are.
 
     Args:
         body: body of MuJoCo's spec that gets the joint.
@@ -96,9 +100,9 @@ def _add_joint(body: Any, name: str, kind: Any, axis: Any) -> Any:
         axis: axis of the joint in the body.
     """
     joint = body.add_joint(name=name, type=kind, axis=axis)
-    for field in ("damping", "armature", "frictionloss", "stiffness", "springref", "margin"):
-        # Some fields are numbers, and some are arrays of coefficients.
-        setattr(joint, field, 0.0 * np.asarray(getattr(joint, field)))
+    for attribute in ("damping", "armature", "frictionloss", "stiffness", "springref", "margin"):
+        # Some attributes are numbers, and some are arrays of coefficients.
+        setattr(joint, attribute, 0.0 * np.asarray(getattr(joint, attribute)))
     joint.limited = 0
     joint.actfrclimited = 0
     joint.actgravcomp = 0

@@ -39,7 +39,10 @@ class MeshLookup:
     found: dict[str, str] = field(default_factory=dict)
 
     def find(self, name: str) -> tuple[str | None, str]:
-        """Find the file of a mesh of a URDF, whose URI often names a ROS package.
+        """Find the file of a mesh of a URDF, and read it into the digest of the model.
+
+        Args:
+            name: file name in the URDF, or a URI, which often names a ROS package.
 
         Returns:
             The path relative to the model file's folder and an empty text, or None and the reason
@@ -62,8 +65,12 @@ class MeshLookup:
     def _list_candidate_paths(self, name: str) -> list[Path]:
         """Return the possible paths of a mesh, in the order in which they are tried.
 
-        A plain name is sought in the folder that the model file states and next to the model file.
-        A name with ``package://`` or ``model://`` is sought in the folders above, as ROS does.
+        * A plain name is sought in the mesh folder that the model file states, next to the model
+          file, and in the mesh folder without its own folders.
+        * ``file://PATH`` is this path.
+        * ``package://PACKAGE/PATH`` and ``model://PACKAGE/PATH`` are sought in the model file's
+          folder and in those above it, as ROS does.
+        * Other schemes are unknown, so there are no paths.
         """
         model_folder = self.files.path.parent
         scheme, separator, uri_path = name.partition("://")
@@ -125,7 +132,8 @@ class OmittedShapes:
     def leave_out(self, spec: Any, geom: Any, label: str, reason: str) -> None:
         """Remove a geom (shape) whose file cannot be used, and record it for a note to the user.
 
-        The notes tell shapes that could have touched others from those that are only visual.
+        Shapes that could have touched others are recorded in `touching`, those that are only visual
+        in `seen`.
 
         Args:
             spec: editable model (`mujoco.MjSpec`); it is changed in place.
@@ -149,7 +157,7 @@ class OmittedShapes:
 
     @property
     def notes(self) -> list[str]:
-        """Notes, one for each reason."""
+        """Notes, one for each reason why colliding shapes, or visual elements, are left out."""
         notes = [
             f"shapes left out, and their contacts, since their file {reason}: "
             f"{format_name_list(labels)}"
@@ -165,9 +173,13 @@ class OmittedShapes:
 def determines_mass(spec: Any, geom: Any, body: Any) -> bool:
     """Return whether the mass of a moving body is computed from a geom (shape).
 
-    Such a geom must not be removed, because the body would lose its mass. MuJoCo's setting
-    ``inertiafromgeom`` decides: always, never, or if the file states no mass of the body. Geoms
-    without mass or density, and those of other groups than the setting states, do not count.
+    Such a geom must not be removed, because the body would lose its mass. It is so if all of these
+    hold:
+
+    * MuJoCo's setting ``inertiafromgeom`` demands it: always, or if the file states no mass of the
+      body, but not if it is "never".
+    * The geom has a mass or a density, and is of a group that counts.
+    * The body moves.
 
     Args:
         spec: the mujoco.MjSpec.
@@ -198,7 +210,10 @@ def is_moving_body(body: Any) -> bool:
 
 
 def find_assets_of_file(spec: Any, path: str) -> list[Any]:
-    """Find the meshes, height fields, skins and textures of a spec that need a file.
+    """Find the meshes, height fields, skins and textures of a spec that refer to a file.
+
+    A name in the spec must be the end of the path. If there is none, only the last parts are
+    compared, since MuJoCo ignores the folders in names with the setting ``strippath``.
 
     Args:
         spec: the mujoco.MjSpec.
@@ -214,7 +229,6 @@ def find_assets_of_file(spec: Any, path: str) -> list[Any]:
             if any(is_needed(name) for name in names if name)
         ]
 
-    # With the setting strippath, MuJoCo ignores the folders in the names.
     return select(lambda name: f"/{path}".endswith(f"/{name}")) or select(
         lambda name: Path(name).name == Path(path).name
     )
@@ -224,7 +238,7 @@ def remove_asset(spec: Any, asset: Any, reason: str, omitted: OmittedShapes) -> 
     """Remove an asset whose file is missing, or which MuJoCo rejects, and the geoms that use it.
 
     The robot then moves as before, without this shape in contacts or pictures. A texture, which has
-    no influence on the motion, is replaced by a single colour.
+    no influence on the motion, is replaced by a single colour, so that its geoms stay.
 
     Args:
         spec: the mujoco.MjSpec.
@@ -239,6 +253,7 @@ def remove_asset(spec: Any, asset: Any, reason: str, omitted: OmittedShapes) -> 
 
     label = asset.file or asset.name
     if isinstance(asset, mujoco.MjsTexture):
+        # A cube map has up to six files in place of one.
         label = next((file for file in (asset.file, *asset.cubefiles) if file), label)
         asset.file, asset.cubefiles = "", []
         asset.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT

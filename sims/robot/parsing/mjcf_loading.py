@@ -36,14 +36,16 @@ MAX_SIZE_ATTRIBUTES = {
 
 
 def read_referenced_files(files: ModelFileReader, root: Element) -> None:
-    """Read the files that an MJCF refers to, so that a changed mesh is another model.
+    """Read the files that an MJCF refers to into the model's digest.
 
-    A missing file is not an error yet: a robot can be simulated without a visual mesh. The folders
-    of the files are those of the element ``<compiler>``; later settings replace earlier ones.
+    So a model with a changed mesh counts as another model. A missing mesh or texture is not an
+    error yet: a robot can be simulated without a visual mesh. The folders of the files are those of
+    the elements ``<compiler>``; later settings replace earlier ones.
 
     Args:
         files: reader of the model file.
-        root: root element of the MJCF; paths that MuJoCo would not find become absolute.
+        root: root element of the MJCF; paths that MuJoCo would not find, those of flexible bodies
+            and attached models, become absolute.
 
     Raises:
         InputError: a count, a size or a file is too large, or an attached model is missing.
@@ -78,6 +80,9 @@ def _check_sizes(files: ModelFileReader, element: Element, factor: float) -> Non
         files: reader of the model file, which makes the errors.
         element: element to check, with all its children.
         factor: number of copies of the element, the product of all counts above it; 1 for the root.
+
+    Raises:
+        InputError: a size is too large, or there would be too many copies.
     """
     for key, value in element.items():
         size_numbers = (
@@ -107,7 +112,7 @@ def _parse_size(text: str) -> float:
 
 
 def _read_attached_model(files: ModelFileReader, element: Element) -> None:
-    """Check an attached model, another model file that MuJoCo opens itself.
+    """Read and check an attached model, another model file that MuJoCo opens itself.
 
     Its content becomes part of the digest, and its sizes are checked like those of the main file.
 

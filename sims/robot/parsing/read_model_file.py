@@ -85,7 +85,11 @@ def read_robot(
 
 
 def restore_floating_joints(robot: RobotModel) -> RobotModel:
-    """Return a robot with the free joints of its file, in place of recorded coordinates."""
+    """Return a robot with the floating joints of its file, in place of slides and hinges.
+
+    The slides and hinges had replaced them, since the pose of the body is recorded. The file is
+    read again; settings that are not in the file are kept.
+    """
     if not robot.recorded_bases:
         return robot
     engine = {k: entry for k, entry in robot.engine_table.items() if k != "recorded_bases"}
@@ -103,10 +107,14 @@ def _make_robot(
 ) -> RobotModel:
     """Repair, complete and compile a parsed model file, and make the robot from it.
 
-    The steps are: repair the XML; let MuJoCo parse it; add the actuators and engine settings of the
-    recording; name unnamed elements; replace floating joints whose pose is recorded; compile with
-    repairs; and, for a URDF, exclude contacts of bodies that overlap in the reference pose, and
-    compile again. Every repair adds a note.
+    Every repair adds a note. The steps are:
+
+    1. Repair the XML, and let MuJoCo parse it.
+    2. Add the actuators and engine settings of the recording, name unnamed elements, and replace
+       floating joints whose pose is recorded.
+    3. Compile with repairs. For a URDF, exclude contacts of bodies that overlap in the reference
+       pose, and compile again.
+    4. Collect notes and the digest in the robot.
 
     Args:
         files: reader of the model file.
@@ -116,6 +124,7 @@ def _make_robot(
         engine: time step and integrator that the recording sets.
         warnings: list to which MuJoCo's warnings are appended while it compiles.
     """
+    # 1. XML.
     source, notes = str(files.path), element_names.rename_invalid_names(root)
     repairs = CompileRepairs(files, OmittedShapes(source))
     if kind == "urdf":
@@ -125,6 +134,7 @@ def _make_robot(
     else:
         mjcf_loading.read_referenced_files(files, root)
         spec = _parse_repaired_file(files, root)
+    # 2. Additions.
     rate_controlled = added_actuators.add_actuators(spec, actuators, source)
     notes += apply_engine_settings(spec, engine, source)
     notes += element_names.name_unnamed_elements(spec)
@@ -133,6 +143,7 @@ def _make_robot(
     )
     notes += base_notes
     parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
+    # 3. Compilation.
     spec, model = repairs.compile(spec)
     _check_model(files, model)
     exclusion_notes = (
@@ -140,6 +151,7 @@ def _make_robot(
     )
     if exclusion_notes:
         spec, model = repairs.compile(spec)
+    # 4. Robot.
     aliases = _map_fused_bodies(parents, {model.body(i).name for i in range(model.nbody)})
     warning_notes = [f"MuJoCo warns: {warning}" for warning in dict.fromkeys(warnings)]
     if model.nu == 0:
@@ -189,11 +201,11 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
         raise InputError(f"{files.path}: option timestep: expected {span}, found {step:g}")
     for field in CHECKED_MODEL_FIELDS:
         values = np.asarray(getattr(model, field), dtype=float)
-        # Also true for NaN.
+        # The comparison is also false for NaN.
         fault_indices = np.argwhere(~(np.abs(values) <= MAX_NUMBER))
         if len(fault_indices):
             first_fault = tuple(fault_indices[0])
-            row = first_fault[0]
+            row, *_ = first_fault
             # MuJoCo's fields begin with "body", "jnt" or "dof", which says what a row belongs to.
             kind, quantity = field.split("_", 1)
             joint = model.dof_jntid[row] if kind == "dof" else row
@@ -205,10 +217,11 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
 
 
 def _parse_repaired_file(files: ModelFileReader, root: Element) -> Any:
-    """Parse the repaired file into a mujoco.MjSpec.
+    """Let MuJoCo parse the repaired XML into a mujoco.MjSpec.
 
     Args:
-        files: reader of the files of the model, which finds the lines of errors.
+        files: reader of the files of the model, which finds the lines of errors; it gets the
+            elements of each line of the text.
         root: root element of the repaired file.
 
     Raises:
@@ -246,10 +259,12 @@ def _map_fused_bodies(parents: Mapping[str, str], compiled: set[str]) -> dict[st
 
 
 def _make_alias_note(aliases: Mapping[str, str]) -> list[str]:
-    """Return a note about links that MuJoCo fused into the body that carries them, or no note.
+    """Return a note about links that MuJoCo fused into other bodies; an empty list without any.
 
-    `aliases` maps the fused link to that body. The user needs the note, because effects act on
-    the whole body.
+    The user needs the note, because effects act on the whole body.
+
+    Args:
+        aliases: body of which each fused link is a part, by name of the link.
     """
     groups: dict[str, list[str]] = {}
     for alias, name in aliases.items():

@@ -44,10 +44,12 @@ def repair_inertials(
 ) -> list[str]:
     """Repair masses and moments of inertia of links that MuJoCo would reject.
 
-    A missing mass becomes zero, and principal moments that are not positive become the nearest ones
-    that a body can have. A link without any inertial stays as it is: MuJoCo computes its mass from
-    its collision shapes. The notes are silent about links whose mass has no influence: those that
-    never move, and mere frames with almost no mass.
+    * A missing mass becomes zero.
+    * Principal moments that are not positive become the nearest ones that a body can have.
+    * A link without any inertial stays as it is: MuJoCo computes its mass from collision shapes.
+
+    The notes are silent about links whose mass has no influence: those that never move, and mere
+    frames with almost no mass.
 
     Args:
         files: reader of the model file.
@@ -74,9 +76,8 @@ def repair_inertials(
             )
         if not find_children(inertials[0], "mass"):
             SubElement(inertials[0], "mass", value="0")
-        tensor = (find_children(inertials[0], "inertia") or [SubElement(inertials[0], "inertia")])[
-            0
-        ]
+        tensors = find_children(inertials[0], "inertia")
+        tensor = tensors[0] if tensors else SubElement(inertials[0], "inertia")
         entries = [parse_number(tensor.get(key)) for key in TENSOR_ENTRIES]
         if not np.isfinite(entries).all():
             raise files.make_error(
@@ -84,7 +85,7 @@ def repair_inertials(
             )
         change = _raise_moments(tensor, entries)
         if name in fixed_links or mass < FRAME_MASS_THRESHOLD or not change:
-            continue
+            continue  # No note is needed.
         if max(map(abs, entries)) < inertia_tensors.NEGLIGIBLE_MOMENT:
             point_masses.append(name)
         else:
@@ -93,13 +94,14 @@ def repair_inertials(
 
 
 def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
-    """Raise principal moments that are not positive; return a text about the change.
-
-    The text has the moments before and after; it is empty if nothing was changed.
+    """Raise principal moments of a link that are not positive to the nearest ones of a real body.
 
     Args:
         tensor: element with the inertia tensor, changed in place.
-        entries: the six entries of the tensor, kg m².
+        entries: the six entries of the tensor in kg m², in the order of `TENSOR_ENTRIES`.
+
+    Returns:
+        Text with the moments before and after; empty if nothing was changed.
     """
     moments, axes = inertia_tensors.compute_principal_moments(entries)
     if moments[0] >= inertia_tensors.NEGLIGIBLE_MOMENT:
@@ -148,12 +150,13 @@ def remove_unusable_shapes(
     """Remove visual shapes, and collision shapes whose mesh is missing or of an unsupported format.
 
     The paths of the other meshes are replaced by those of the files found. A missing mesh is only
-    acceptable if the mass of the link does not follow from its shapes.
+    acceptable if the mass of the link does not follow from its shapes, or does not matter.
 
     Args:
         files: reader of the model file.
         links: link elements by name; changed in place.
-        compiler: settings of MuJoCo's compiler; changed in place.
+        compiler: settings of MuJoCo's compiler; those about mesh files are removed, since the paths
+            no longer depend on them.
         fixed_links: links that are fused to the world, whose mass does not matter.
 
     Returns:
@@ -181,9 +184,7 @@ def remove_unusable_shapes(
 def _resolve_collision_shape(
     files: ModelFileReader, name: str, shape: Element, meshes: MeshLookup, has_mass: bool
 ) -> bool:
-    """Set the path of a collision shape's mesh, and return whether the shape can be read.
-
-    A shape without a mesh, such as a box, can always be read. A mesh that cannot be read is noted.
+    """Set the path of a collision shape's mesh.
 
     Args:
         files: reader of the files of the model.
@@ -191,6 +192,13 @@ def _resolve_collision_shape(
         shape: its collision element, in which the path is set.
         meshes: finds the files of meshes.
         has_mass: whether the mass of the link is specified, so that a missing mesh is not an error.
+
+    Returns:
+        Whether the shape can be read. A shape without a mesh, such as a box, always can; a mesh
+        that cannot be read is recorded for a note.
+
+    Raises:
+        InputError: the mesh cannot be read, and the mass of the link depends on it.
     """
     for mesh in find_children(shape, "geometry", "mesh"):
         file = mesh.get("filename") or ""
@@ -228,10 +236,16 @@ MuJoCo raises its time constant, in s, to two time steps.
 def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
     """Repair a URDF in place, so that MuJoCo reads it and nothing is ignored without a note.
 
-    The steps are: reject unexpanded macros; add a missing world link; remove elements that MuJoCo
-    does not read; give joints unique names; check that the links form a tree with a moving joint;
-    remove repeated elements; repair inertials; remove shapes without a file, meaningless limits,
-    and relations between joints (mimics) that MuJoCo cannot represent.
+    1. Reject unexpanded macros, add a missing world link, remove elements that MuJoCo does not
+       read, and give joints unique names.
+    2. Check that the links form a tree with a moving joint, and note links that MuJoCo fixes to the
+       world.
+    3. Remove repeated elements, repair inertials, and remove shapes without a file, meaningless
+       limits, and relations between joints (mimics) that MuJoCo cannot represent.
+
+    Args:
+        files: reader of the files of the model.
+        root: root element of the URDF.
 
     Returns:
         Notes, one line for each kind of repair or omission.
@@ -239,6 +253,7 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
     Raises:
         InputError: the links do not form a tree, or nothing in it moves.
     """
+    # 1. Elements and names.
     _reject_macros(files, root)
     links, joints = _collect_links(files, root), find_children(root, "joint")
     notes = [
@@ -246,6 +261,7 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
         *_remove_unread_elements(root),
         *_make_joint_names_unique(files, joints),
     ]
+    # 2. Tree.
     parents = _find_parent_links(files, links, joints)
     if not any(joint.get("type") in MOVING_JOINT_TYPES for joint in joints):
         raise InputError(f"{files.path}: none of its {len(joints)} joints moves")
@@ -255,6 +271,7 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
         notes.append(
             f"held to the world, as MuJoCo does with a URDF's root: {format_name_list(heavy_roots)}"
         )
+    # 3. Contents of links and joints.
     notes += _remove_repeated_elements([*links.values(), *joints])
     notes += repair_inertials(files, links, fixed_links)
     _check_mujoco_settings(files, root)
@@ -320,7 +337,16 @@ def _add_world_link(
 ) -> list[str]:
     """Add the link `world` if joints refer to it and the file does not define it.
 
-    Simulators with a link of this name read such a file in this way.
+    Simulators in which the fixed world is a link of this name read such a file in this way.
+
+    Args:
+        files: reader of the files of the model.
+        root: root element of the URDF, changed in place.
+        links: links by name, changed in place.
+        joints: elements of the joints.
+
+    Returns:
+        A note in a list; an empty list if nothing was added.
     """
     if WORLD_LINK in links or not any(
         _get_link_name(files, joint, "parent") == WORLD_LINK for joint in joints
@@ -332,6 +358,9 @@ def _add_world_link(
 
 def _make_joint_names_unique(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:
     """Give each joint a unique name, which MuJoCo requires, and return notes about the changes.
+
+    A joint without a name is called ``joint_CHILD``, after its child link; a repeated name gets
+    underscores.
 
     Args:
         files: reader of the files of the model.
@@ -383,6 +412,7 @@ def _find_parent_links(
     Raises:
         InputError: the links do not form a tree, or the type of a joint is unknown.
     """
+    # Existing links, and one parent each.
     parents: dict[str, tuple[str, Element]] = {}
     for joint in joints:
         label, kind = truncate_text(joint.get("name") or ""), joint.get("type") or ""
@@ -403,10 +433,11 @@ def _find_parent_links(
                 f"link {truncate_text(child)} has two parent joints; a closed loop needs an MJCF",
             )
         parents[child] = (parent, joint)
+    # No cycles: the way to the root has fewer steps than there are links.
     for name in links:
         ancestor, steps = name, 0
         while ancestor in parents:
-            ancestor, steps = parents[ancestor][0], steps + 1
+            (ancestor, _), steps = parents[ancestor], steps + 1
             if steps > len(links):
                 raise files.make_error(links[name], f"link {truncate_text(name)} is its own parent")
     return parents
@@ -435,9 +466,16 @@ def _get_compiler_element(root: Element) -> Element:
 
 
 def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
-    """Raise an error for wrong MuJoCo settings in a URDF, which MuJoCo would ignore there.
+    """Check the element ``<mujoco>`` of a URDF, in which MuJoCo would ignore wrong settings.
 
     Each setting is parsed alone as an MJCF, in which MuJoCo reports unknown names.
+
+    Args:
+        files: reader of the files of the model.
+        root: root element of the URDF.
+
+    Raises:
+        InputError: MuJoCo rejects a setting.
     """
     import mujoco
 
@@ -455,11 +493,13 @@ def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
 def _remove_repeated_elements(parts: Sequence[Element]) -> list[str]:
     """Remove repeated elements in a link or a joint, except for the first of each kind.
 
+    A link may have several visual and collision shapes; these stay.
+
     Args:
-        parts: Links and joints of the file; changed in place.
+        parts: links and joints of the file; changed in place.
 
     Returns:
-        A note that names what was removed; empty if nothing was.
+        A note in a list that names what was removed; an empty list if nothing was.
     """
     repeated = []
     for part in parts:
@@ -493,9 +533,17 @@ def read_velocity_limits(root: Element) -> dict[str, float]:
 def _remove_meaningless_limits(joints: Sequence[Element]) -> list[str]:
     """Remove limits that are meaningless, and return notes about the limits of joints.
 
-    Removed are limits of joints without one degree of freedom, effort limits (maximum force or
-    torque) that are not positive, position limits of continuous joints, and position ranges that
-    are empty. Valid effort limits are noted too, because they have an influence on the motion.
+    Removed are
+
+    * all limits of joints without one degree of freedom,
+    * effort limits (maximum force or torque) that are not positive,
+    * position limits of continuous joints, without a note,
+    * position ranges that are empty.
+
+    Valid effort limits are noted too, because they have an influence on the motion.
+
+    Args:
+        joints: elements of the joints, changed in place.
     """
     invalid_efforts, empty_ranges, effort_limits = [], [], []
     for joint in joints:
@@ -551,8 +599,11 @@ def stiffen_mimics(spec: Any) -> None:
 def _remove_unsupported_mimics(joints: Sequence[Element]) -> list[str]:
     """Remove mimic elements that MuJoCo cannot represent, and return notes about all of them.
 
-    A mimic joint follows another joint: q = multiplier q_other + offset. Both must have one
-    degree of freedom.
+    A mimic joint follows another joint: q = multiplier q_other + offset. Both must exist and have
+    one degree of freedom.
+
+    Args:
+        joints: elements of the joints, changed in place.
     """
     kinds = {joint.get("name"): joint.get("type") for joint in joints}
     kept_mimics, removed_mimics = [], []

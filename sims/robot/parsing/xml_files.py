@@ -46,7 +46,7 @@ class ModelFileReader:
     given: list[Element] = field(default_factory=list)
 
     def make_error(self, element: Element | None, message: str) -> InputError:
-        """Make the error for an element of the file, with file and line.
+        """Make the error for an element of the file; the message begins with file and line.
 
         Args:
             element: the element; None for the file as a whole.
@@ -98,6 +98,10 @@ def parse_tree(files: ModelFileReader, path: Path) -> Element:
     Python's own reader does not tell the lines of elements, and repeats entities that a hostile
     file declares. So a parser is used whose calls for each tag build the tree, note the line of
     every element for messages, and refuse declarations.
+
+    Args:
+        files: reader of the model, which records the file, its size and the lines of elements.
+        path: path of the file.
 
     Raises:
         InputError: the file cannot be read, is too large or is not XML, or it declares something
@@ -182,8 +186,9 @@ def resolve_includes(files: ModelFileReader, root: Element) -> None:
 
     Args:
         files: reader of the model.
-        root: root element; it is changed in place.
+        root: root element; it is changed in place, with all its descendants.
     """
+    # The elements are listed first, since their children change.
     for parent in list(root.iter()):
         if any(child.tag == "include" for child in parent):
             parent[:] = _expand_includes(files, parent)
@@ -226,6 +231,7 @@ def format_tree(root: Element) -> tuple[str, list[Element]]:
         The text, and the element that begins in each line.
     """
     elements = list(root.iter())
+    # Line breaks are only before the first child, and between two children.
     for element in elements:
         element.text = "\n" if len(element) else None
         element.tail = None

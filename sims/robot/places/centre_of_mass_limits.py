@@ -29,9 +29,16 @@ def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
     """Return the limits of the offset of a body's centre of mass, as the link's size allows it.
 
     A fitted offset outside them would put the centre of mass outside the link. The limits are a box
-    that contains the geoms and sites of the link and the joints of its child links. A link without
-    geoms is as large as its inertia needs, and one without any of these and inertia is assumed to
-    be as long as its distance from its parent.
+    with a margin around points of the link:
+
+    * the geoms and sites of the link, and the joints of its child links,
+    * without geoms also the corners of the box that has its mass and inertia.
+
+    If all points coincide, the link is assumed to be as long as its distance from its parent.
+
+    Args:
+        robot: robot with the body.
+        body: name of the body.
 
     Returns:
         (3, 2) lowest and highest offset from the specified centre of mass, in metres, along the
@@ -42,6 +49,7 @@ def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
     points = np.array(list(_iterate_link_points(model, data, body_id)))
     low, high = points.min(axis=0), points.max(axis=0)
     longest_side = float((high - low).max()) or _estimate_link_length(model, body_id)
+    # A thin rod gets a thickness.
     half_sizes = (
         np.maximum(0.5 * (high - low), MIN_THICKNESS_SHARE * longest_side)
         + MARGIN_SHARE * longest_side
@@ -70,6 +78,7 @@ def _iterate_link_points(model: Any, data: Any, body_id: int) -> Iterator[Array]
     origin, axes = data.xpos[body_id], data.xmat[body_id].reshape(3, 3)
     yield np.zeros(3)
     yield model.body_ipos[body_id]
+    # Planes and height fields are surroundings without a size of the link.
     flat = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     bodies = _list_fixed_bodies(model, body_id)
     if not model.body_geomnum[bodies].any():
@@ -99,8 +108,9 @@ def _iterate_link_points(model: Any, data: Any, body_id: int) -> Iterator[Array]
 def _compute_box_of_inertia(model: Any, number: int) -> Array:
     """Return half the sides (3,), in metres, of the uniform box with a body's mass and inertia.
 
-    A box with sides 2 a, 2 b, 2 c and mass m has the moment of inertia m (b² + c²) / 3 about the
-    side a.
+    A box with sides 2 a, 2 b, 2 c and mass m has the moment of inertia I_a = m (b² + c²) / 3 about
+    the side a, so that a² = 1.5 (I_b + I_c - I_a) / m. A negative square counts as zero; without a
+    mass, all sides are zero.
 
     Args:
         model: compiled model.
@@ -109,8 +119,8 @@ def _compute_box_of_inertia(model: Any, number: int) -> Array:
     mass, moments = float(model.body_mass[number]), model.body_inertia[number]
     if mass <= 0.0:
         return np.zeros(3)
-    squares: Array = 1.5 * (moments.sum() - 2.0 * moments) / mass
-    return np.sqrt(np.maximum(squares, 0.0))
+    squared_half_sides: Array = 1.5 * (moments.sum() - 2.0 * moments) / mass
+    return np.sqrt(np.maximum(squared_half_sides, 0.0))
 
 
 def _list_fixed_bodies(model: Any, number: int) -> list[int]:
@@ -121,6 +131,7 @@ def _list_fixed_bodies(model: Any, number: int) -> list[int]:
         number: number of the body.
     """
     bodies = [number]
+    # Children have larger numbers than their parents.
     for child in range(number + 1, model.nbody):
         if model.body_parentid[child] in bodies and not model.body_jntnum[child]:
             bodies.append(child)
@@ -130,7 +141,8 @@ def _list_fixed_bodies(model: Any, number: int) -> list[int]:
 def _estimate_link_length(model: Any, number: int) -> float:
     """Return the assumed length, in metres, of a link without a specified shape.
 
-    It is the distance of the link from its parent, or else the longest such distance in the robot.
+    It is the distance of the link from its parent; if that is zero, the longest such distance in
+    the robot; if that is zero, too, `UNKNOWN_LENGTH`.
 
     Args:
         model: compiled model.

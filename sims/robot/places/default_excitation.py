@@ -76,11 +76,13 @@ class LazyDefaultRecording:
 
 
 def make_default_recording(robot: RobotModel) -> DefaultRecording:
-    """Make the default recording: all joint positions, with commands that move each joint.
+    """Make the default recording: all joint positions are observed, and commands move each joint.
 
-    The commands oscillate about the reference pose of the file. A servo receives positions or
-    velocities. A motor receives the force that holds the pose, plus a force that would move a free
-    joint. A robot without actuators is moved by forces at its joints.
+    The commands oscillate about the reference pose of the file:
+
+    * A servo receives positions or velocities.
+    * A motor receives the force that holds the pose, plus a force that would move a free joint.
+    * A robot without actuators is moved by forces at its joints.
     """
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     commands = _make_commands(robot, joints)
@@ -91,16 +93,16 @@ def make_default_recording(robot: RobotModel) -> DefaultRecording:
         share = next(
             (s for s in amplitude_shares if _stays_within_ranges(robot, joints, commands, s)), 1.0
         )
-    observe = tuple(f"q.{joint.name}" for joint in joints)
     return DefaultRecording(
-        observe=observe, inputs={c.name: c.to_signal_text(share) for c in commands}
+        observe=tuple(f"q.{joint.name}" for joint in joints),
+        inputs={command.name: command.to_signal_text(share) for command in commands},
     )
 
 
 def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[ExcitationCommand]:
     """Make the commands of all actuators on the joints, or forces at the joints if there are none.
 
-    Each command oscillates about a holding value that balances gravity in the reference pose.
+    Each command oscillates about a value that holds the reference pose.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -125,16 +127,15 @@ def _make_commands(robot: RobotModel, joints: Sequence[Joint]) -> list[Excitatio
 def _compute_reference_forces(
     robot: RobotModel, joints: Sequence[Joint]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the force that holds each joint in the reference pose, and the amplitude of a force.
-
-    A motor's command is the holding force plus an oscillation that would move a free joint visibly.
+    """Return the two forces of which a motor's command consists: to hold a joint, and to move it.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-        joints: joints to excite.
+        joints: all joints with one coordinate.
 
     Returns:
-        Both in N or N·m, by the name of the joint.
+        By the name of the joint, in N or N·m: the force that holds it in the reference pose against
+        gravity and springs; and the amplitude of an oscillating force that moves it visibly.
     """
     import mujoco
 
@@ -158,6 +159,8 @@ def _compute_reference_forces(
 def _choose_amplitude(joint: Joint, start: float) -> float:
     """Return the amplitude of a joint's motion, in rad or m; it stays clear of the joint's limits.
 
+    If the motion begins at a limit or beyond it, only a share of the range limits the amplitude.
+
     Args:
         joint: joint to move.
         start: position about which it moves, in rad or m.
@@ -173,12 +176,11 @@ def _choose_amplitude(joint: Joint, start: float) -> float:
 def _make_command(
     robot: RobotModel, actuator: Actuator, joint: Joint, holding: float, force: float
 ) -> ExcitationCommand:
-    """Make a sinusoidal command of an actuator that moves its joint within all limits.
+    """Make an oscillating command of an actuator that moves its joint within all limits.
 
-    It excites the robot when simulated recordings are made without commands of the user.
-
-    A servo receives a position or a velocity, a motor a force. The centre of the oscillation is
-    moved if the control range leaves it no room.
+    Its unit depends on the actuator: a position, a velocity, or for a motor a force on the joint
+    divided by gear and gain. The control range limits centre and amplitude. If the centre is so
+    near to an end of the range that no oscillation is possible, it becomes the middle of the range.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -190,6 +192,7 @@ def _make_command(
     model = robot.compiled
     start = float(model.qpos0[joint.position])
     amplitude = _choose_amplitude(joint, start)
+    # Centre and amplitude without limits.
     if actuator.kind in ("position", "pid"):
         centre, command_amplitude = start, amplitude
     elif actuator.kind == "velocity":
@@ -198,11 +201,11 @@ def _make_command(
         gain = float(model.actuator_gear[actuator.id, 0] * model.actuator_gainprm[actuator.id, 0])
         gain = gain or 1.0
         centre, command_amplitude = holding / gain, force / abs(gain)
+    # Limits.
     if actuator.range is not None:
         low, high = actuator.range
         centre = min(max(centre, low), high)
         margin = min(centre - low, high - centre)
-        # A set point at the end of the control range is moved to its middle.
         if margin < MAX_RANGE_SHARE * command_amplitude:
             centre = 0.5 * (low + high)
             margin = 0.5 * (high - low)

@@ -18,11 +18,17 @@ MIN_PARALLEL_COSINE = 1.0 - 1e-9
 def observable_axes(robot: RobotModel, body: str) -> tuple[int, ...]:
     """Return the frame axes along which a shift of a body's centre of mass changes the motion.
 
-    If all hinges between the world and the body have parallel axes, a shift along that direction
-    moves no mass relative to the hinges and changes no torque of gravity. So the frame axis nearest
-    to that direction is omitted; offsets along the two others give every possible motion. A body
-    that only slides has no observable axis. A floating body, or one that turns about several
-    directions, has three.
+    The cases are:
+
+    * Only slides between the world and the body: no axis, since it does not turn.
+    * Hinges with parallel axes: a shift along that direction moves no mass relative to the hinges
+      and changes no torque of gravity. So the frame axis nearest to that direction is omitted;
+      offsets along the two others give every possible motion.
+    * Hinges about several directions, or a floating body: all three axes.
+
+    Args:
+        robot: robot with the body.
+        body: name of the body.
 
     Returns:
         Observable axes, 0, 1, 2 for x, y, z.
@@ -32,24 +38,25 @@ def observable_axes(robot: RobotModel, body: str) -> tuple[int, ...]:
     model, number = robot.compiled, robot.body(body).id
     hinge, slide = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
     data = make_reference_data(model)
-    axes = []  # of the hinges between the body and the world, in world coordinates
-    carrier = number
-    while carrier:
-        first, count = model.body_jntadr[carrier], model.body_jntnum[carrier]
+    hinge_axes = []  # unit vectors in the world, of the hinges between the body and the world
+    ancestor = number
+    while ancestor:
+        first, count = model.body_jntadr[ancestor], model.body_jntnum[ancestor]
         for joint in range(first, first + count):
             kind = int(model.jnt_type[joint])
             if kind == hinge:
-                axes.append(data.xaxis[joint])
+                hinge_axes.append(data.xaxis[joint])
             elif kind != slide:
                 return (0, 1, 2)
-        carrier = int(model.body_parentid[carrier])
-    if not axes:
+        ancestor = int(model.body_parentid[ancestor])
+    if not hinge_axes:
         return ()
-    if any(abs(float(axis @ axes[0])) < MIN_PARALLEL_COSINE for axis in axes):
+    direction = hinge_axes[0]
+    if any(abs(float(axis @ direction)) < MIN_PARALLEL_COSINE for axis in hinge_axes):
         return (0, 1, 2)
-    along = data.xmat[number].reshape(3, 3).T @ axes[0]
-    # For a diagonal direction the nearest frame axis is omitted, since the two others suffice.
-    nearest_axis = int(np.argmax(np.abs(along).round(9)))
+    direction_in_body = data.xmat[number].reshape(3, 3).T @ direction
+    # Equal components are rounded, so that rounding errors do not decide between them.
+    nearest_axis = int(np.argmax(np.abs(direction_in_body).round(9)))
     return tuple(axis for axis in range(3) if axis != nearest_axis)
 
 
@@ -80,10 +87,12 @@ MAX_UNOBSERVABLE_SHARE = 1e-6
 def observable_tilts(robot: RobotModel, name: str) -> tuple[int, ...]:
     """Return the axes of a body's frame about which a tilt of a joint's axis changes the motion.
 
-    Only such tilts can be fitted. The frame axis nearest to the joint's own axis is omitted, since
-    the two others give every direction. A tilt out of the plane of a planar mechanism changes
-    nothing to first order, so it is omitted as well: the joint forces with and without a tilt are
-    compared in random states.
+    Only such tilts can be fitted. Two are omitted:
+
+    * The frame axis nearest to the joint's own axis, since tilts about the two others give every
+      direction.
+    * A tilt that changes no forces to first order, such as one out of the plane of a planar
+      mechanism. Forces with opposite small tilts are compared in random states.
 
     Args:
         robot: model of the robot.
@@ -98,27 +107,29 @@ def observable_tilts(robot: RobotModel, name: str) -> tuple[int, ...]:
     nearest_axis = int(np.argmax(np.abs(file_axis).round(9)))
     observable = []
     for axis in (axis for axis in range(3) if axis != nearest_axis):
+        # To first order, the axis moves along the cross product of the tilt's axis and itself.
         tilt_direction = np.cross(np.eye(3)[axis], file_axis)
         forces_by_sign = []
         for sign in (1.0, -1.0):
             axis_vector = file_axis + sign * TILT_STEP * tilt_direction
             model.jnt_axis[joint.id] = axis_vector / np.linalg.norm(axis_vector)
             forces_by_sign.append(_compute_random_state_forces(model, robot.joints))
-        change = (forces_by_sign[0] - forces_by_sign[1]) / (2.0 * TILT_STEP)
-        if (np.abs(change) > MAX_UNOBSERVABLE_SHARE * np.abs(forces_by_sign[0]).max()).any():
+        forward, backward = forces_by_sign
+        change = (forward - backward) / (2.0 * TILT_STEP)
+        if (np.abs(change) > MAX_UNOBSERVABLE_SHARE * np.abs(forward).max()).any():
             observable.append(axis)
     return tuple(observable)
 
 
 def _compute_random_state_forces(model: Any, joints: tuple[Joint, ...]) -> Array:
-    """Return bias forces and inertia matrices in fixed random states, as one vector.
+    """Return bias forces (gravity, Coriolis) and inertia matrices in random states, as one vector.
 
     They determine the motion. So a change of the model that changes none of these numbers cannot be
-    observed.
+    observed. The states are the same in each call.
 
     Args:
         model: compiled model.
-        joints: joints that have random positions.
+        joints: joints of the robot; those with one coordinate have random positions.
     """
     import mujoco
 

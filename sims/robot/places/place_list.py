@@ -101,7 +101,8 @@ def list_places(
     """List the places of a robot by kind: joint, actuator, body, channel, contact, geom.
 
     A place is where an effect can act. Each has the units and the typical sizes that scale the
-    plausible ranges of effects, and what the model file states there.
+    plausible ranges of effects, and what the model file states there. Contacts and geoms are those
+    of the recording (`RobotModel.contacts`); of the geoms, only those with a radius.
 
     Args:
         robot: robot whose places are listed.
@@ -124,13 +125,14 @@ def list_places(
 
 
 def _list_joint_places(robot: RobotModel) -> list[EffectPlace]:
-    """List the joints with one coordinate; the index of each is that of its coordinate."""
+    """List the joints with one coordinate, in the order of the coordinates."""
     from sims.robot.dynamics.joint_scales import coefficient_scales
 
     scales = coefficient_scales(robot)
     may_be_coupled = list_coupling_places(robot)
     bodies = robot.compiled.jnt_bodyid
-    last_joint_of_body = {int(body): i for i, body in enumerate(bodies)}
+    # Later joints of a body replace earlier ones.
+    last_joint_of_body = {int(body): joint_id for joint_id, body in enumerate(bodies)}
     return [
         EffectPlace(
             name=joint.name,
@@ -152,9 +154,11 @@ def _list_joint_places(robot: RobotModel) -> list[EffectPlace]:
 
 
 def _list_actuator_places(robot: RobotModel, joints: Sequence[EffectPlace]) -> list[EffectPlace]:
-    """List the actuators; most attributes are those of the joint that they drive.
+    """List the actuators as places, which are like that of the joint that they drive.
 
-    Actuators that move no joint, or joints in an unknown way, are left out.
+    Their units and typical sizes are those of the joint. An actuator on a tendon or a site has
+    similar sizes (`_make_actuator_place`). Actuators that act along neither an angle nor a length
+    are left out.
 
     Args:
         robot: robot whose actuators are listed.
@@ -164,25 +168,31 @@ def _list_actuator_places(robot: RobotModel, joints: Sequence[EffectPlace]) -> l
     joints_by_name = {place.name: place for place in joints}
     places = []
     for actuator in robot.actuators:
-        joint = joints_by_name.get(actuator.joint or "")
-        joint = joint or _make_actuator_place(actuator, joints, mass)
-        if joint is None:
+        driven_place = joints_by_name.get(actuator.joint or "")
+        driven_place = driven_place or _make_actuator_place(actuator, joints, mass)
+        if driven_place is None:
             continue
         places.append(
-            joint._replace(
+            driven_place._replace(
                 name=actuator.name,
                 signal=f"u.{actuator.name}",
                 unit=actuator.control_unit,
                 stated=_get_servo_gains(robot, actuator.id),
                 words=f"actuator {actuator.name}",
-                servo=actuator.kind == "position" and joint.coordinate is not None,
+                servo=actuator.kind == "position" and driven_place.coordinate is not None,
             )
         )
     return places
 
 
 def _list_body_places(robot: RobotModel) -> list[EffectPlace]:
-    """List the moving bodies, with how far a wrong centre of mass or a payload may be off."""
+    """List the moving bodies, with the largest plausible offsets of centre of mass and payload.
+
+    The offsets are boxes in the body's frame, relative to the stated centre of mass. That of the
+    centre of mass is the box of the link. That of a payload is a cube about its middle, since a
+    payload may stick out of the link: to the longest side of the box, or to half the length of the
+    robot's longest link. Along axes in which offsets cannot be observed, both ends are zero.
+    """
     mass = _compute_moving_mass(robot)
     longest_link = float(np.linalg.norm(robot.compiled.body_pos[1:], axis=1).max(initial=0.0))
     places = []
@@ -241,8 +251,8 @@ def _compute_moving_mass(robot: RobotModel) -> float:
 def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> EffectPlace:
     """Return the contact of two geoms as a place at which effects can act.
 
-    It has the friction that the model file states, and how much softer or stiffer the contact may
-    become.
+    It has the friction that the model file states, and how much stiffer the contact may become: its
+    time constant is reduced by at most `MAX_REDUCTION`, and not below MuJoCo's minimum.
 
     Args:
         robot: model of the robot.
@@ -256,11 +266,12 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
 
     friction, solref = read_contact_parameters(robot, pair)
     options = robot.compiled.opt
+    time_constant = float(solref[0])  # negative if `solref` is a stiffness and a damping
     min_softness_change = -MAX_REDUCTION
-    if not options.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE and solref[0] > 0:
+    if not options.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE and time_constant > 0:
         # MuJoCo uses no smaller time constant than two time steps.
         min_softness_change = max(
-            min_softness_change, min(2.0 * options.timestep / float(solref[0]) - 1.0, 0.0)
+            min_softness_change, min(2.0 * options.timestep / time_constant - 1.0, 0.0)
         )
     names = [get_geom_name(robot.compiled, geom) for geom in find_pair_geoms(robot, pair)]
     return EffectPlace(
@@ -279,9 +290,10 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
 
 
 def has_radius(robot: RobotModel, geom: int) -> bool:
-    """Return whether a geom of a moving body is a sphere, capsule, ellipsoid or cylinder.
+    """Return whether a geom is a sphere, capsule, ellipsoid or cylinder of a moving body.
 
-    Only the radius of such a shape can be wrong in the model file and be visible in the motion.
+    Such a geom, for example a wheel, may have a wrong radius in the model file that shows in the
+    motion.
 
     Args:
         robot: Robot with its compiled model.
@@ -317,12 +329,18 @@ def make_geom_place(robot: RobotModel, name: str) -> EffectPlace:
 def _make_actuator_place(
     actuator: Actuator, joints: Sequence[EffectPlace], mass: float
 ) -> EffectPlace | None:
-    """Return a place like a joint for an actuator on a tendon or a site; None if there is none.
+    """Return the place of an actuator on a tendon or a site, with typical sizes like a joint's.
+
+    Its typical force and inertia are the largest ones of the joints that its tendon moves. At a
+    site, or on a tendon without joints, they are the weight and the mass of the robot.
 
     Args:
         actuator: an actuator that drives no single joint.
         joints: places of the joints.
-        mass: mass in kg of all moving bodies, whose weight is the typical force at a site.
+        mass: mass in kg of all moving bodies.
+
+    Returns:
+        The place; None if the actuator acts along neither an angle nor a length.
     """
     if actuator.motion is None:
         return None
@@ -344,9 +362,10 @@ def _get_servo_gains(robot: RobotModel, actuator: int) -> dict[str, float]:
 
 
 def _get_body_file_values(robot: RobotModel, body: int) -> dict[str, float]:
-    """Return the gravity compensation of a body, and its distance from a parent that moves.
+    """Return the gravity compensation of a body, and the length of the link that carries it, in m.
 
-    The distance is zero if no moving body carries it: then it moves the whole robot.
+    The length is the distance from its parent body. It is zero if the parent does not move, since
+    another distance would then only move the whole robot.
     """
     model = robot.compiled
     has_moving_parent = int(model.body_weldid[model.body_parentid[body]]) != 0

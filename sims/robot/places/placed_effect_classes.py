@@ -105,7 +105,12 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
 
     A registered effect is written for a system of one coordinate. The class passes it the
     coordinate or the signal of its place only, and has the units and plausible ranges that apply
-    there.
+    there. Forces, dry friction and hidden states get a method for this (`force`, `limit`, `act`);
+    the engine treats all other effects.
+
+    Args:
+        effect: registered effect.
+        effect_place: place, with what the model file states there.
     """
     tilts = effect_place.tilts if effect.name == "joint.axis" else None
     observable_coefficients = [c for c in effect.coefficients if tilts is None or c.name in tilts]
@@ -119,16 +124,18 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
         changed["limit"] = _limit_of(effect)
     elif issubclass(effect, HiddenStateEffect):
         changed["act"] = _make_act_method(effect)
+        # Coefficients: without those whose quantity the model file states.
         declared_coefficients = effect.between or effect.coefficients
         coefficients = [
             _add_search_starts(_adapt_to_place(effect, c, effect_place))
             for c in declared_coefficients
             if not _has_quantity(effect_place, c)
         ]
+        # Simpler effects that it contains: those that are declared; and with a rotor, the armature
+        # effect, which is a rigid transmission with the drive's inertia.
         contained_names = [
             f"{contained_effect}@{effect_place.name}" for contained_effect in effect.contains
         ]
-        # A rigid transmission with the drive's inertia is the armature effect.
         drive = f"inertia.armature@{effect_place.name}"
         for number, c in enumerate(coefficients):
             if c.of == "rotor":
@@ -150,7 +157,7 @@ def _force_of(effect: type[Force]) -> Callable[[Force, Array, StateSnapshot], Ar
     """
 
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
-        """Compute the force (L, D) along the joint of the effect."""
+        """Compute the forces (L, D), which are zero at all joints but that of the effect."""
         joint = cast(int, self.coordinate)
         joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
         result = np.zeros_like(moment.x)
@@ -163,20 +170,23 @@ def _force_of(effect: type[Force]) -> Callable[[Force, Array, StateSnapshot], Ar
 def make_shared_effects(
     effect: type[Effect], drives: Sequence[EffectPlace]
 ) -> Iterator[type[Effect]]:
-    """Yield the class of an effect that all drives share, if they are of one kind.
+    """Yield the class of an effect that all drives share, such as a sagging common supply.
 
-    Drives with a common supply, for example, lose force together when any of them needs much. At
-    most one class is yielded; none for fewer than two driven joints.
+    Drives with a common supply lose force together when any of them needs much. Exactly one class
+    is yielded if the effect is a force, at least two joints are driven, and all drives are of one
+    kind (angles or lengths); otherwise none.
 
     Args:
         effect: registered effect.
         drives: places of the actuators.
     """
+    # Drives on tendons and sites have no coordinate.
     drives = [drive for drive in drives if drive.coordinate is not None]
     joints = {drive.coordinate: drive for drive in drives}
     kinds = {drive.kind for drive in drives}
     if len(joints) < 2 or len(kinds) > 1 or not issubclass(effect, Force):
         return
+    # Its coefficients have the units of a drive, and the sum of the typical forces.
     combined_place = drives[0]._replace(size=sum(drive.size for drive in joints.values()))
     coefficients = [_adapt_to_place(effect, c, combined_place) for c in effect.coefficients]
     changed: dict[str, Any] = {
@@ -190,30 +200,24 @@ def make_shared_effects(
 def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., Array]:
     """Make the `force` method of an effect that all drives share, such as a supply that sags.
 
-    The effect acts on each drive's joint, and depends on the sum of all drives' absolute
-    forces.
+    The method evaluates the registered effect at each driven joint. There the effect depends on the
+    load of the supply, the sum of all drives' absolute forces.
+
+    Args:
+        effect: registered effect, written for a system of one coordinate.
+        joints: coordinates of the driven joints.
     """
 
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
-        """Compute the forces (L, D) along the joints, each from the total load of the supply.
-
-        A supply is shared by several drives, so its voltage sags with the sum of their forces.
-        `joints` and `effect` are bound by the enclosing function.
-
-        Shapes: L batch elements, D joints, K coefficients.
-
-        Args:
-            self: Effect at the place.
-            c: (K, L, 1) coefficients.
-            moment: State of the robot.
-        """
+        """Compute the forces (L, D) along all driven joints from the total load of the supply."""
         robot = cast(RobotSnapshot, moment)
-        total_load = sum(np.abs(robot.carried[0][:, joint : joint + 1]) for joint in joints)
-        result = np.zeros_like(moment.x)
+        drive_forces, _ = robot.carried
+        total_load = sum(np.abs(drive_forces[:, joint : joint + 1]) for joint in joints)
+        forces = np.zeros_like(moment.x)
         for joint in joints:
             joint_snapshot = replace(robot.get_joint_snapshot(joint), shared=total_load)
-            result[:, joint] = effect.force(self, c, joint_snapshot)[:, 0]
-        return result
+            forces[:, joint] = effect.force(self, c, joint_snapshot)[:, 0]
+        return forces
 
     return force
 
@@ -221,8 +225,8 @@ def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., A
 def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapshot], Array]:
     """Make the `limit` method of a dry friction at one joint from that of the registered effect.
 
-    The registered effect is written for a system with one coordinate, so it receives that joint
-    alone.
+    The registered effect is written for a system with one coordinate. The new method passes it the
+    state of its joint alone; `limit` is the largest friction force.
     """
 
     def limit(self: Friction, c: Array, moment: StateSnapshot) -> Array:
@@ -234,7 +238,10 @@ def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapsho
 
 
 def _has_quantity(effect_place: EffectPlace, c: Coefficient) -> bool:
-    """Return whether the model file specifies the quantity of a coefficient.
+    """Return whether the model file states the inertia of the rotor that a coefficient stands for.
+
+    The coefficient, the rotor's share of the joint inertia, is not needed then. Other coefficients
+    are always needed.
 
     Args:
         effect_place: place of the effect, with the values of the model file.
@@ -249,23 +256,18 @@ def _make_taking_method(
 ) -> Callable[[Effect, Array, str, Array], Array]:
     """Make the `taking` method, which starts a flexible joint at the values of a fitted armature.
 
-    When a flexible joint replaces the armature effect `drive`, the fitted armature is the
-    inertia of the rotor. The coefficient with index `number` becomes its share of the joint
-    inertia, within `bounds`.
+    A flexible joint may replace an armature effect. The fitted armature is then the inertia of its
+    rotor, from which its coefficient, the rotor's share of the joint inertia, follows.
+
+    Args:
+        drive: name of the armature effect, with its place.
+        inertia: inertia of the joint in kg m² or kg.
+        number: index of the rotor's share among the coefficients of the flexible joint.
+        bounds: lowest and highest value of the share.
     """
 
     def taking(_: Effect, c: Array, simpler: str, armature: Array) -> Array:
-        """Convert the inertia of an armature effect to the rotor's share of the joint inertia.
-
-        `drive` is the name of the armature effect, `number` the index of the rotor's share among
-        the coefficients, `inertia` that of the joint, and `bounds` the range of the share.
-
-        Args:
-            _: the armature effect; unused.
-            c: coefficients of the flexible joint.
-            simpler: name of the effect that the flexible joint replaces.
-            armature: coefficient of the armature effect, kg m² or kg.
-        """
+        """Return coefficients c that include the effect `simpler`, if it is the armature effect."""
         if simpler != drive:
             return c
         coefficients: Array = c.copy()
@@ -293,16 +295,7 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
     def act(
         self: HiddenStateEffect, c: Array, moment: StateSnapshot, state: HiddenState
     ) -> tuple[Array, Array]:
-        """Compute the force (L, D) along the effect's joint, and the rate of its hidden state.
-
-        Shapes: L batch elements, D joints, K coefficients.
-
-        Args:
-            self: effect at its joint.
-            c: (K, L, 1) coefficients.
-            moment: state of the robot.
-            state: hidden state of the effect.
-        """
+        """Compute the forces (L, D), zero at other joints, and the rate of the hidden state."""
         joint = cast(int, self.coordinate)
         joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
         forces = np.zeros_like(moment.x)
@@ -314,16 +307,17 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
 
 
 def make_effect_family(effect: type[Effect], members: Sequence[type[Effect]]) -> type[Effect]:
-    """Make the family of an effect: all its places, with one coefficient each or a shared one.
+    """Make the family of an effect: a class that acts at all its places at once.
 
-    A family acts at all places at once, as if it were one effect; `parts` divides it. The
-    coefficients are named ``coefficient@place``, or shared for `SHARED_COEFFICIENT_EFFECTS`.
-    Searches test a family before its single places.
+    Its coefficients are those of all members, named ``coefficient@place``. The members of
+    `SHARED_COEFFICIENT_EFFECTS`, such as a delay, have the same coefficients instead. The method
+    `parts` divides the family into its members. Searches test a family before its single places.
 
     Args:
         effect: registered effect.
-        members: classes of the effect at each place.
+        members: classes of the effect at each place, which is not empty.
     """
+    # 1. Coefficients.
     shared = effect.name in SHARED_COEFFICIENT_EFFECTS
     first = members[0].coefficients
     coefficients: list[Coefficient] = list(first) if shared else []
@@ -343,6 +337,7 @@ def make_effect_family(effect: type[Effect], members: Sequence[type[Effect]]) ->
             for i, member_effect in enumerate(instances)
         )
 
+    # 2. Simpler effects that it contains: its members, theirs, and families of simpler effects.
     contains = {member.name for member in members}
     for member in members:
         contains.update(member.contains)
@@ -367,6 +362,8 @@ def _create_placed_effect(
     changed: Mapping[str, Any],
 ) -> type[Effect]:
     """Create a subclass of a registered effect that acts at one place of a robot, or at all places.
+
+    The simpler effects that it contains are those of the registered effect at the same place.
 
     Args:
         effect: registered effect.
@@ -396,8 +393,9 @@ def _create_placed_effect(
 
 def _unify_units(c: Coefficient) -> Coefficient:
     """Give a coefficient one unit and range for all kinds of systems: the first that it has."""
-    i = next(k for k, unit in enumerate(c.units) if unit is not None)
-    return replace(c, units=(c.units[i],) * 3, plausible=(c.plausible[i],) * 3)
+    kinds = zip(c.units, c.plausible, strict=True)
+    unit, plausible = next((unit, bounds) for unit, bounds in kinds if unit is not None)
+    return replace(c, units=(unit,) * 3, plausible=(plausible,) * 3)
 
 
 def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPlace) -> Coefficient:
@@ -415,7 +413,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
         c: coefficient as declared in the library.
         effect_place: place, with the values that the model file states there.
     """
-    # 1. Unit.
+    # 1. Unit. The quantity `of` may be that of the input, of a servo's error, or of the reading.
     system_kind = SYSTEM_KINDS.index(_KINDS[effect_place.kind])
     unit, (low, high) = c.units[system_kind], c.plausible[system_kind]
     lower_limit = c.least
@@ -424,7 +422,6 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     elif c.of.startswith("reading"):
         unit = c.of.replace("reading", effect_place.unit)
     # 2. Scale.
-    # Plausible ranges of the library refer to small joints, so forces are scaled with the joint.
     if unit is None:
         unit = "1"
     force_ratio = effect_place.size / REFERENCE_FORCES[effect_place.kind]
@@ -434,15 +431,14 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
         low, high = low / force_ratio, high / force_ratio
     if effect.name == "inertia.armature":
         high = 3.0 * effect_place.inertia
-    if c.of == "give":
+    if c.of == "give":  # a compliance
         high = 1.0 / (effect_place.inertia * MIN_LOAD_FREQUENCY**2)
     # 3. Total.
     upper_limit = c.most
     has_total = effect.at == "joint" or effect.name in EFFECTS_WITH_TOTAL
     file_value = effect_place.stated.get(effect.name) if has_total else None
     if file_value is not None:
-        # The total must not be negative, so the difference can at most remove the value of the
-        # file.
+        # The difference can at most remove the value of the file.
         high = max(high, 2.0 * abs(file_value))
         low = lower_limit = min(0.0 - file_value, 0.0)
     # 4. Limits of the place.
@@ -451,6 +447,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     if c.name in effect_place.limits.get(effect.name, {}):
         lower_limit, highest = effect_place.limits[effect.name][c.name]
         upper_limit = highest if np.isfinite(highest) else None
+        # The limits of a payload's offset lie outside the link, and its plausible range within it.
         if effect.name == "payload":
             begin, end = effect_place.limits["mass.offset"][c.name]
             low, high = (begin, end) if begin < end else (low, high)
@@ -467,9 +464,10 @@ def make_effect_classes(
     native: Collection[str],
     compiles: Callable[[type[Effect]], bool] = lambda _: True,
 ) -> Iterator[type[Effect]]:
-    """Yield the classes of an effect at all places of a robot, followed by its family.
+    """Yield the classes of an effect at all places of a robot, followed by its family, if any.
 
-    A family is one effect at all places together; searches test it before its members.
+    A family is one effect at all places together. Nothing is yielded if the robot cannot have the
+    effect.
 
     Args:
         effect: registered effect.
@@ -477,6 +475,7 @@ def make_effect_classes(
         native: names of effects that the engine writes into the model.
         compiles: returns whether the model with an effect at one place compiles.
     """
+    # Effects of the world have no places.
     if effect.at == "world":
         if effect.name in native or (issubclass(effect, Sensor) and not effect.filters):
             yield make_world_effect(effect)
@@ -488,7 +487,7 @@ def make_effect_classes(
     ]
     members = [member for member in members if compiles(member)]
     yield from members
-    # Position channels of encoders are alike, while other channels have units of their own.
+    # Of the channels, only positions form a family; others have units of their own.
     family_members = [m for m in members if effect.at != "channel" or m.place.startswith("q.")]
     if len(family_members) > 1 and effect.name not in EFFECTS_WITHOUT_FAMILY:
         yield make_effect_family(effect, family_members)
@@ -497,17 +496,21 @@ def make_effect_classes(
 
 
 def _needs_no_engine_support(effect: type[Effect]) -> bool:
-    """Return whether an effect can act at one of several places without the engine's support.
+    """Return whether an effect can be evaluated outside MuJoCo, at one of several places.
+
+    This is so for effects on inputs and sensors; for forces and dry friction that need no more than
+    their own joint; and for effects with a hidden state, unless they connect the drive of a joint
+    to its load without declaring it.
 
     Args:
-        effect: Effect class that may act at joints, actuators or sensors.
+        effect: registered effect that the engine does not write into the model.
     """
     if issubclass(effect, Input | Sensor):
         return True
     # A force that needs more than its own joint is undefined at one of several joints.
     has_known_need = effect.needs in ("", "guide", "input", "servo")
     if issubclass(effect, HiddenStateEffect):
-        # An effect with a share of the joint's inertia must declare what it connects.
+        # An effect that has a part of the joint's inertia overrides `behind`.
         return bool(effect.between) or effect.behind is HiddenStateEffect.behind
     return has_known_need and issubclass(effect, Force | Friction)
 
@@ -518,26 +521,32 @@ def _acts_at(
     """Return whether a place has the quantity that an effect changes.
 
     For example, a servo effect needs a position servo, and an effect of a drive needs a joint with
-    an actuator. `places` lists all places by kind.
+    an actuator.
+
+    Args:
+        effect: registered effect.
+        effect_place: place of the kind at which the effect acts.
+        places: all places of the robot by kind.
     """
-    if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[effect_place.kind]) is None:
+    first_coefficient = effect.coefficients[0]
+    is_driven = any(
+        actuator.coordinate == effect_place.coordinate for actuator in places["actuator"]
+    )
+    # Joints. The effect may not exist along a length, or along an angle.
+    if effect.at == "joint" and first_coefficient.unit(_KINDS[effect_place.kind]) is None:
         return False
     if effect.at == "joint" and effect_place.is_base and effect.name not in BASE_EFFECTS:
         return False
     if effect.at == "joint" and effect.needs == "input":
-        return any(
-            actuator.coordinate == effect_place.coordinate for actuator in places["actuator"]
-        )
+        return is_driven
     if issubclass(effect, HiddenStateEffect) and effect.between:
         # The effect connects the drive of a joint to its load, so both must exist.
-        return effect_place.last and any(
-            actuator_place.coordinate == effect_place.coordinate
-            for actuator_place in places["actuator"]
-        )
+        return effect_place.last and is_driven
     if effect.needs == "servo" and not effect_place.servo:
         return False
     if effect.name == "joint.coupling" and not effect_place.coupled:
         return False
+    # Actuators.
     if effect.at == "actuator":
         if issubclass(effect, ModelValueEffect):
             return effect_place.stated.get(effect.name, 1.0) != 0.0
@@ -546,15 +555,17 @@ def _acts_at(
             return False
         # On a tendon or a site, only the command is defined.
         return effect_place.coordinate is not None or issubclass(effect, Input)
+    # Geometry: a link without length, and an axis whose tilt does not show.
     if effect.name == "link.length" and not effect_place.stated["link.length"]:
         return False
     if effect.name == "joint.axis" and not effect_place.tilts:
         return False
+    # Channels.
     if effect.name in POSITION_SENSOR_EFFECTS and not effect_place.name.startswith("q."):
         return False
     # Angular coefficients apply to encoders, and not to other channels.
-    if effect.at == "channel" and not effect.coefficients[0].of:
-        unit = effect.coefficients[0].unit(_KINDS[effect_place.kind])
+    if effect.at == "channel" and not first_coefficient.of:
+        unit = first_coefficient.unit(_KINDS[effect_place.kind])
         if unit is None or (unit == "rad" and effect_place.unit != "rad"):
             return False
     return True
