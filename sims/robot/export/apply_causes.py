@@ -121,8 +121,8 @@ def apply_causes(
     such as a joint's friction or a wrong mass. The steps are:
 
     1. Add the elements that causes need: couplings, contact pairs, elements in series.
-    2. Write each cause into the fields of the model. Causes that no model file can state, such as a
-       sensor's bias, become notes.
+    2. Write each cause into the fields (numbers) of the compiled model, and note which elements it
+       changes. Causes that no model file can state, such as a sensor's bias, become notes.
     3. Change a copy of the editable model until it compiles to these fields.
 
     Args:
@@ -153,7 +153,7 @@ def apply_causes(
     applied_causes: list[FittedCause] = []
     # Elements in series take their share of armatures, so they are written last.
     for cause in sorted(fitted_causes, key=lambda c: (get_application_order(c), _is_in_series(c))):
-        before = {name: values.copy() for name, values in target_values.items()}
+        values_before = {name: values.copy() for name, values in target_values.items()}
         places_in_series = {applied.place for applied in applied_causes if _is_in_series(applied)}
         # The elements in series at a place are written once, with the first of their causes.
         try:
@@ -169,9 +169,13 @@ def apply_causes(
             note = _SOFT_FRICTION_NOTE
         if note and note not in notes:
             notes.append(note)
+        # Comments: at each element with changed numbers, at an added joint, and at the actuators of
+        # a coupled drive.
         changed_elements = [
             statement.element
-            for statement in find_differing_statements(robot.compiled, before, target_values, 0.0)
+            for statement in find_differing_statements(
+                robot.compiled, values_before, target_values, 0.0
+            )
         ]
         if _is_in_series(cause):
             second = ModelElement("joint", robot.joint(find_series_joint(robot, cause.place)).id)
@@ -182,11 +186,11 @@ def apply_causes(
             for actuator in (a for a in robot.actuators if a.joint == cause.place):
                 element = ModelElement("actuator", actuator.id)
                 comments.setdefault(element, []).append(cause.format(recording))
+    # 3. Editable model.
     spec, model = _compile_changed_spec(robot, target_values)
-    # 3. Compliant flanks need a second compilation.
     if any(is_compliant_flank(transmission)[0] for transmission in series.values()):
-        # The solver parameters of compliant flanks depend on all causes, so they are computed
-        # again.
+        # The solver parameters of compliant flanks (a gap with a spring) depend on the compiled
+        # inertia, and so on all causes.
         robot = prepare_flanks_for_file(robot, series, model)
         spec, model = _compile_changed_spec(robot, target_values)
     # Only the text is stored, since a compiled spec holds all meshes a second time.
@@ -212,7 +216,10 @@ def _is_in_series(cause: FittedCause) -> bool:
 
 
 def _combine_series_elements(causes: Sequence[FittedCause]) -> dict[str, SeriesElement]:
-    """Combine the elements that causes put in series with joints, by joint."""
+    """Combine the springs and gaps that causes put in series with a joint to one element by joint.
+
+    The numbers of an element have the shape (1,).
+    """
     elements: dict[str, list[SeriesElement]] = {}
     for cause in (cause for cause in causes if _is_in_series(cause)):
         numbers = {name: np.array([number.value]) for name, number in cause.numbers.items()}
@@ -227,18 +234,21 @@ def _write_cause(
     cause: FittedCause,
     series: Mapping[str, SeriesElement],
 ) -> str | None:
-    """Write a cause into the fields of the model; return a note for the user, or None.
+    """Write a cause into the fields of the model, which a model file shall have.
 
     Args:
         target_values: fields of the model, changed in place.
-        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
+        robot: robot with the elements that causes add.
         cause: effect at a place with its fitted coefficients.
-        series: elements in series, by place, that are not yet written.
+        series: elements in series with joints, by place, that are not yet written.
+
+    Returns:
+        A note for the user, or None.
 
     Raises:
         UnstatableCauseError: a model file cannot state the cause.
     """
-    # A coupling is an element of the robot, which has been added before.
+    # A coupling is an element of the robot, which has its coefficient already.
     if cause.effect == COUPLING_EFFECT:
         return None
     if is_gravity_compensated(cause.effect, cause.numbers):
@@ -264,14 +274,14 @@ def _write_cause(
 
 
 def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
-    """Return whether an element is within a ``<frame>``, which moves its position and axes.
+    """Return whether the joint or body of a cause is within a ``<frame>`` of the model file.
 
-    The compiled numbers are then not those of the file, so an effect on geometry cannot be written
-    as a changed attribute.
+    A frame moves the position and the axes of its contents. The compiled numbers are then not those
+    of the file, so an effect on geometry cannot be written as a changed attribute.
 
     Args:
-        robot: model of the robot.
-        cause: the geometry effect with its place.
+        robot: robot with the spec of the model file.
+        cause: effect on the geometry of a joint (``joint.``) or a body.
     """
     elements = robot.spec.joints if cause.effect.startswith("joint.") else robot.spec.bodies
     return any(element.name == cause.place and element.frame is not None for element in elements)
@@ -281,11 +291,11 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
     """Change a copy of the robot's editable model until it compiles to the wanted fields.
 
     The compiler derives fields (numbers of the compiled model) from attributes of the file, so a
-    change may also modify values that should stay. Each of several rounds corrects this:
+    change may also modify values that should stay. So in each of at most `MAX_CORRECTION_ROUNDS`
+    rounds:
 
-    1. Find the attributes whose fields differ from the wanted ones.
+    1. Find the attributes whose fields differ from the wanted ones; without any, return the model.
     2. Set them, and compile the model.
-    3. Report an error if some still differ after the last round.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -293,10 +303,13 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
 
     Returns:
         The changed mujoco.MjSpec, and the compiled model.
+
+    Raises:
+        RuntimeError: fields still differ after the last round; this is a program error.
     """
     spec, model = robot.spec.copy(), robot.compiled
     elements = _index_spec_elements(spec)
-    tolerance = 0.0
+    tolerance = 0.0  # Later rounds ignore rounding by the compiler.
     for _ in range(MAX_CORRECTION_ROUNDS):
         # 1. Differences.
         statements = find_missing_statements(model, target_values, tolerance)
@@ -308,7 +321,6 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
         if any(statement.element.kind == "body" for statement in statements):
             _keep_masses(spec, target_values)
         model, tolerance = spec.compile(), ROUNDING_TOLERANCE
-    # 3. Remaining differences.
     missing_statements = find_missing_statements(model, target_values, tolerance)
     if missing_statements:
         raise RuntimeError(f"{robot.path}: the model does not take {missing_statements[0]}")
@@ -333,10 +345,9 @@ def _keep_masses(spec: Any, target_values: Fields) -> None:
 
 
 def _index_spec_elements(spec: Any) -> dict[ModelElement, Any]:
-    """Return the elements of a spec by those of the compiled model.
+    """Return the elements of an editable model (`mujoco.MjSpec`) by kind and compiled number.
 
-    Args:
-        spec: Editable model of MuJoCo (`MjSpec`).
+    A body is there twice: as ``body`` for its inertial, and as ``frame`` for its pose.
     """
     # Elements have numbers only after compilation.
     spec.compile()
@@ -360,7 +371,8 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
     """Set attributes of an element of an editable MuJoCo model.
 
     Values from the compiled model are converted to the form that the editable model expects:
-    enumerations, flags, integers, degrees.
+    enumerations, flags, integers, degrees. Other attributes that would take precedence over the new
+    values are reset.
 
     Args:
         element: element of a `mujoco.MjSpec`; it is changed in place.
@@ -368,6 +380,7 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
     """
     import mujoco
 
+    # 1. Values.
     kind = statement.element.kind
     spec_names = {attribute.name: attribute.spec for attribute in ATTRIBUTES_BY_KIND[kind]}
     for name, values in statement.values.items():
@@ -383,8 +396,9 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
         else:
             value = _convert_to_attribute(element, name, spec_names[name], values)
         setattr(element, spec_names[name], value)
+    # 2. Attributes that would take precedence: a full tensor, or another form of the orientation of
+    # an inertial, and `springdamper` of a joint.
     if kind == "body":
-        # Otherwise a full tensor or an orientation from the file would take precedence.
         element.explicitinertial = True
         element.fullinertia = np.full(6, np.nan)
         element.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
@@ -393,11 +407,16 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
 
 
 def _convert_to_inner_frame(body: Any, position: Sequence[float]) -> Array:
-    """Convert a position in the parent body to the innermost of the frames around a body.
+    """Convert the position of a body from its parent body's frame to the innermost frame around it.
 
-    MuJoCo replaces bodies that it fuses into their parents by such frames. The position of a body
-    in the editable model is relative to the frame, but in the compiled model to the parent. First
-    the pose of the innermost frame in the parent is composed, from the inside to the outside.
+    MuJoCo replaces bodies that it fuses into their parents by elements ``<frame>``, which may be
+    nested. The position of a body in the editable model is relative to the innermost of them, but
+    in the compiled model to the parent. First the pose of the innermost frame in the parent is
+    composed, from the inside to the outside.
+
+    Args:
+        body: body of the editable model; without frames the position stays as it is.
+        position: x, y, z in m.
     """
     # Importing scipy.spatial takes 0.1 s, and most model files have no fused bodies.
     from scipy.spatial.transform import Rotation
@@ -428,9 +447,10 @@ def _convert_to_attribute(element: Any, name: str, attribute: str, values: Seque
 
     if name in ANGLE_ATTRIBUTES and element.type == mujoco.mjtJoint.mjJNT_HINGE:
         return float(np.rad2deg(values[0])) if element.compiler.degree else values[0]
-    present_values = np.asarray(getattr(element, attribute))
-    if present_values.ndim == 0:
+    shape = np.shape(getattr(element, attribute))
+    if not shape:
         return values[0]
-    padded = np.zeros(present_values.shape)
+    # A spec may have more or fewer numbers than the compiled model.
+    padded = np.zeros(shape)
     padded[: len(values)] = values[: len(padded)]
     return padded

@@ -46,7 +46,9 @@ _NONE, _FIXED, _AFFINE = 0.0, 0.0, 1.0
 def render_default_class(
     applied: ModifiedModel, joint: int, actuator: int | None, name: str, notes: Sequence[str] = ()
 ) -> str:
-    """Render a default class as ``<default class="NAME">``, with a comment for each cause.
+    """Render the numbers of a joint and its actuator as a default class of an MJCF.
+
+    The text is an element ``<default class="NAME">`` with a comment for each cause.
 
     Args:
         applied: model with the causes applied.
@@ -74,8 +76,11 @@ def _format_default_element(
     """Return the tag of an element in a default class, and its attributes as text.
 
     Attributes with MuJoCo's default values are omitted, and those that belong to the pose of one
-    joint. An actuator that is a position servo becomes ``position`` with its gains; any other one
-    becomes ``general``.
+    joint. In addition:
+
+    * A joint without dry friction omits the solver parameters of friction.
+    * An actuator omits ranges that do not limit it. If it is a position servo, it becomes
+      ``position`` with its gains; any other one becomes ``general``.
 
     Args:
         element: the joint or actuator.
@@ -123,8 +128,10 @@ def render_model_using_class(
 ) -> str:
     """Render the model file with all causes, where a joint and its actuator use a default class.
 
-    The class has their numbers, so these are removed from their own elements. The result is
-    compiled to check that it is the same model.
+    1. Refer to the class in the elements of the joint and the actuator, and remove the numbers from
+       them that the class has.
+    2. Without asset files, remove the folders of assets.
+    3. Insert the class, and compile the result to check that it is the same model.
 
     Args:
         robot: robot as read from its model file.
@@ -137,6 +144,7 @@ def render_model_using_class(
     Raises:
         NotEditableError: the rendered file differs from the modified model; states the field.
     """
+    # 1. Elements.
     document = MjcfDocument(applied.text.encode(), robot.path)
     tags = document.map_to_compiled_ids(applied.model)
     tag = tags[ModelElement("joint", joint)]
@@ -150,9 +158,11 @@ def render_model_using_class(
         tag.renamed, _ = _format_default_element(
             element, list_all_attributes(applied.model, element, applied.target_values)
         )
+    # 2. Folders.
     if not any(element_tag.name in FILE_ELEMENTS for element_tag in document.walk()):
         for compiler in document.find_elements("compiler"):
             compiler.removed |= {"meshdir", "texturedir"}
+    # 3. Class.
     document.root.within.insert(
         0, ([], "<default>\n    " + text.replace("\n", "\n    ") + "\n  </default>")
     )

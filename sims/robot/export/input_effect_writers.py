@@ -31,21 +31,28 @@ class _Actuator:
     """The fields of one actuator, and its properties."""
 
     def __init__(self, fields: Fields, robot: RobotModel, place: str) -> None:
-        """Read the fields of the actuator with this name, and its properties for eqs. (1) and (2).
+        """Read the fields of the actuator with this name, and its properties.
 
-        An actuator exerts the force gain * input + bias. `gain` and `bias` are views, so that
-        writing to them changes `fields`. `direct` means that the input is the control itself,
-        without activation dynamics such as a filter; `fixed`, that the gain is constant;
-        `clamped`, that the activation is limited; `single`, that there is one control.
+        An actuator exerts the force gain * input + bias (1).
+
+        Args:
+            fields: fields of the compiled model; `gain`, `bias` and `command` are views of them, so
+                that writing to these changes the fields.
+            robot: robot with the actuator.
+            place: name of the actuator.
         """
         import mujoco
 
         self.id = robot.actuator(place).id
         self.control = int(robot.compiled.actuator_ctrladr[self.id])
+        # Whether there is one control.
         self.single = int(robot.compiled.actuator_ctrlnum[self.id]) == 1
         self.fields = fields
+        # Whether the input is the control itself, without activation dynamics such as a filter.
         self.direct = self._get_integer_field("actuator_dyntype") == int(mujoco.mjtDyn.mjDYN_NONE)
+        # Whether the activation is limited.
         self.clamped = bool(robot.compiled.actuator_actlimited[self.id])
+        # Whether the gain is constant.
         self.fixed = self._get_integer_field("actuator_gaintype") == int(
             mujoco.mjtGain.mjGAIN_FIXED
         )
@@ -80,7 +87,7 @@ class _Actuator:
         return self._get_integer_field("actuator_dyntype") in kinds and not self.clamped
 
     def shift(self, force: float) -> None:
-        """Add a constant force in N or N m to the force that the actuator computes.
+        """Add a constant to the force of the actuator, before its gear, in N or N m.
 
         In MuJoCo the force is gain * control + bias; the constant is the first bias parameter.
         """
@@ -118,11 +125,16 @@ def _write_input_gain(actuator: _Actuator, a: float) -> None:
     """Write an error a of the input gain into the actuator.
 
     The actuator's gain is multiplied by 1 + a (1). Its control range is divided by the same factor,
-    since the range limits the command before the gain here, but after it in reality (2).
+    since MuJoCo's range limits the command before the gain, but in reality it does so after the
+    gain (2).
 
     Args:
         actuator: actuator whose fields are changed.
-        a: error of the gain.
+        a: relative error of the gain.
+
+    Raises:
+        UnstatableCauseError: the force of the actuator is not proportional to a gain and one
+            control, or 1 + a is not positive.
     """
     can_scale = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
     if not can_scale:
@@ -138,17 +150,20 @@ def _write_input_gain(actuator: _Actuator, a: float) -> None:
 def _write_input_bias(actuator: _Actuator, b: float) -> None:
     """Write an input bias b into the actuator: a constant force, and a shifted control range.
 
-    With the command u and an input gain 1 + a that is in the fields already (`input_factor`), the
-    input is (1 + a) u + b. So the actuator with gain g gets the additional force g b (1), and the
-    limits of its control are shifted by -b / (1 + a) (2). The gain in the fields is g (1 + a).
+    With the command u and an input gain 1 + a that is in the fields already, the input is
+    (1 + a) u + b. So the actuator with gain g gets the additional force g b (1), and the limits of
+    its control are shifted by -b / (1 + a) (2). The gain in the fields is g (1 + a).
 
     Args:
         actuator: actuator whose fields are changed.
         b: bias, in the unit of the control.
+
+    Raises:
+        UnstatableCauseError: the force of the actuator is not a gain times one control plus a bias.
     """
     if not actuator.linear:
         raise UnstatableCauseError(_NOT_LINEAR)
-    input_factor, _ = actuator.command
+    input_factor, _ = actuator.command  # 1 + a
     low, high = actuator.limits()
     actuator.limit(low - b / input_factor, high - b / input_factor)  # (2)
     actuator.shift(float(actuator.gain[0] / input_factor * b))  # (1)
@@ -165,13 +180,17 @@ def _write_saturation(actuator: _Actuator, s: float) -> None:
 
     Args:
         actuator: actuator whose fields are changed.
-        s: limit of the input.
+        s: limit of the input, in the unit of the control.
+
+    Raises:
+        UnstatableCauseError: the force of the actuator is not a gain times one control plus a bias,
+            or no command is in both ranges.
     """
     if s <= 0:
         return
     if not actuator.linear:
         raise UnstatableCauseError(_NOT_LINEAR)
-    input_factor, b = actuator.command
+    input_factor, b = actuator.command  # 1 + a, and b
     low, high = actuator.limits()
     low, high = max(low, (-s - b) / input_factor), min(high, (s - b) / input_factor)
     if low >= high:
@@ -180,13 +199,17 @@ def _write_saturation(actuator: _Actuator, s: float) -> None:
 
 
 def _write_delay(actuator: _Actuator, delay: float) -> str | None:
-    """Write an input delay in seconds into the actuator's delay and history buffer.
-
-    Return a note about it.
+    """Write an input delay into the actuator: its delay, and a buffer of past controls.
 
     Args:
         actuator: actuator whose fields are changed.
-        delay: delay in seconds.
+        delay: delay in seconds; zero changes nothing.
+
+    Returns:
+        A note for the user, or None.
+
+    Raises:
+        UnstatableCauseError: the delay is negative, or the file states one already.
     """
     step = float(actuator.fields["opt.timestep"][0])
     if delay == 0:
@@ -196,8 +219,9 @@ def _write_delay(actuator: _Actuator, delay: float) -> str | None:
     if actuator.fields["actuator_delay"][0, actuator.id] > 0:
         raise UnstatableCauseError("the file states a delay already")
     actuator.fields["actuator_delay"][0, actuator.id] = delay
-    # MuJoCo interpolates linearly between past controls. This equals the mean, over a step, of
-    # delayed controls that are constant over their steps.
+    # The buffer's number of samples and kind of interpolation (1 is linear). Linear interpolation
+    # between past controls is the mean, over a step, of delayed controls that are constant over
+    # their steps.
     actuator.fields["actuator_history"][0, actuator.id] = (ceil(delay / step) + 1, 1)
     delay_note = "" if delay >= step else f", delays it by a whole step, {step:g} s"
     return (
@@ -209,11 +233,16 @@ def _write_delay(actuator: _Actuator, delay: float) -> str | None:
 def _write_lag(actuator: _Actuator, lag: float) -> str | None:
     """Write a first-order lag of the input as an exact activation filter (FILTEREXACT) of MuJoCo.
 
-    `lag` is the time constant in seconds. Return a note about it.
-
     Args:
         actuator: actuator whose fields are changed.
-        lag: time constant in seconds.
+        lag: time constant in seconds; zero or less changes nothing.
+
+    Returns:
+        A note for the user, or None.
+
+    Raises:
+        UnstatableCauseError: the actuator has activation dynamics already, no constant gain, or not
+            one control.
     """
     import mujoco
 
@@ -240,12 +269,16 @@ def _write_constant_force(fields: Fields, robot: RobotModel, cause: FittedCause)
        displacement.
     2. An actuator of the joint gets a bias, if no force limit would clip it.
 
-    Return a note, or None.
-
     Args:
         fields: fields of the compiled model, changed in place.
-        robot: model of the robot as read from its file.
+        robot: robot of this model.
         cause: cause with its fitted force.
+
+    Returns:
+        A note for the user, or None.
+
+    Raises:
+        UnstatableCauseError: the joint has neither a linear spring nor an actuator without limits.
     """
     # 1. Spring.
     joint, (force,) = robot.joint(cause.place), cause.coefficients
@@ -278,14 +311,13 @@ def _write_constant_force(fields: Fields, robot: RobotModel, cause: FittedCause)
 
 
 def _write_option(fields: Fields, robot: RobotModel, cause: FittedCause) -> None:  # noqa: ARG001
-    """Write an option of the model file, such as the time step in seconds.
-
-    An option that is a word in the file has MuJoCo's number of the word.
+    """Write an option of MuJoCo's solver, such as the time step in seconds, into the model.
 
     Args:
         fields: fields of the model, changed in place.
         robot: unused; all writers have the same arguments.
-        cause: the cause, whose coefficient is the value.
+        cause: the cause, whose coefficient is the value of the option; for a word, such as the name
+            of an integrator, MuJoCo's number of the word.
     """
     (number,) = cause.coefficients
     fields[f"opt.{OPTION_EFFECTS[cause.effect]}"][0] = number
@@ -302,12 +334,15 @@ _INPUT_WRITERS: Mapping[str, Callable[[_Actuator, float], str | None]] = {
 
 
 def _write_input_effect(fields: Fields, robot: RobotModel, cause: FittedCause) -> str | None:
-    """Write an effect on an input into its actuator; return a note about it, or None.
+    """Write an effect on an input into its actuator.
 
     Args:
         fields: fields of the compiled model, changed in place.
-        robot: robot as read from its model file.
-        cause: cause with its fitted coefficient.
+        robot: robot with the actuator.
+        cause: effect at an actuator with its only coefficient.
+
+    Returns:
+        A note for the user, or None.
 
     Raises:
         UnstatableCauseError: the actuator cannot state the effect.
@@ -326,12 +361,12 @@ COMMAND_WRITERS: Mapping[str, Callable[[Fields, RobotModel, FittedCause], str | 
 
 
 def get_application_order(cause: FittedCause) -> tuple[int, int]:
-    """Return the sort key of a cause in the order of application.
+    """Return the sort key of a cause in the order in which causes are written into a model.
 
-    Integrator settings come first, then causes in the model, then input effects in the order in
-    which a command passes them.
+    1. Time step and other options of the solver, on which the stiffness of dry friction depends.
+    2. Causes that are numbers of the model.
+    3. Effects on inputs, in the order in which a command passes them; and constant forces.
     """
-    # The stiffness of dry friction depends on the time step, so that comes first.
     if cause.effect.startswith("numerics."):
         return 0, 0
     names = list(COMMAND_WRITERS)

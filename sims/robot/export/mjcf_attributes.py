@@ -56,14 +56,18 @@ class AttributeStatement:
 
 
 def _get_element_values(model: Any, element: ModelElement, name: str, values: Any) -> Any:
-    """Return the values of an element in a field, whose name tells what its rows are.
+    """Return the values of an element in a field of a compiled model.
+
+    The beginning of the field's name tells what its rows are: velocities, positions, controls, or
+    otherwise the elements themselves. An option has no rows.
 
     Args:
         model: compiled model.
         element: joint with one coordinate, body, actuator, pair, geom, or the options.
         name: name of the field.
-        values: values of all elements, one row for each; those of an option have no rows.
+        values: values of the field.
     """
+    # Fields of the model with the row of an element.
     row_fields = {
         "dof_": "jnt_dofadr",
         "qpos": "jnt_qposadr",
@@ -91,11 +95,11 @@ class MjcfAttribute(NamedTuple):
     column: int | None = None
 
     def read(self, fields: Fields, model: Any, element: ModelElement) -> Values:
-        """Return the values of an element.
+        """Return the values of the attribute of an element, as numbers.
 
         Args:
-            fields: fields of a compiled model.
-            model: compiled model with the element.
+            fields: fields from which they are read, by name.
+            model: compiled model, which tells the row of the element in each field.
             element: the element.
         """
         parts = [
@@ -290,22 +294,22 @@ def list_all_attributes(
 
 
 def _is_equal(first: Values, second: Values, tolerance: float) -> bool:
-    """Return whether values are equal to within `tolerance` times the largest.
+    """Return whether two lists of values are equal to within a relative tolerance.
 
     Args:
         first: values of an attribute.
-        second: as many other ones.
-        tolerance: largest difference, relative to the largest value.
+        second: as many other values.
+        tolerance: largest difference, relative to the largest absolute value of both.
     """
     scale = np.maximum(np.abs(first), np.abs(second)).max(initial=0.0)
     return bool((np.abs(np.subtract(first, second)) <= tolerance * scale).all())
 
 
 def get_enum_word(name: str, value: float) -> str:
-    """Return the MJCF word for a value of an enumeration.
+    """Return the MJCF word for a value of an enumeration, such as ``affine`` for mjBIAS_AFFINE.
 
     Args:
-        name: name of the attribute.
+        name: name of the attribute, such as ``biastype``.
         value: number of the enumeration.
     """
     import mujoco
@@ -313,8 +317,9 @@ def get_enum_word(name: str, value: float) -> str:
     if name == "interp":
         return ("zoh", "linear", "cubic")[int(value)]
     choice = getattr(mujoco, ENUM_ATTRIBUTES[name])(int(value))
-    text = str(choice.name).partition("_")[2].lower()
-    return {"rk4": "RK4", "euler": "Euler"}.get(text, text)
+    _, _, word = str(choice.name).partition("_")
+    # Most words are in small letters in a file.
+    return {"rk4": "RK4", "euler": "Euler"}.get(word.lower(), word.lower())
 
 
 class UnstatableCauseError(Exception):

@@ -83,19 +83,21 @@ class MjcfDocument:
     def map_to_compiled_ids(self, model: Any) -> dict[ModelElement, XmlElement]:
         """Map the elements of the compiled model to those of the text.
 
-        So a change of the compiled model leads to the place in the text. Bodies, joints and
-        actuators are found by their order, which is that of the text; geoms (shapes) and contact
-        pairs are found by their names.
+        So a change of the compiled model leads to the element in the text. Bodies, joints and
+        actuators are found by their order, which is that of the text. Geoms are found by their
+        names, and contact pairs by those of their geoms; unnamed ones are left out.
 
         Args:
-            model: Compiled model of MuJoCo.
+            model: compiled MuJoCo model (`mujoco.MjModel`).
 
         Raises:
-            NotEditableError: the compiled model has other elements than the text.
+            NotEditableError: the compiled model has other elements than the text, or the text has
+                elements that generate others.
         """
         for tag in self.walk():
             if tag.name in _UNSUPPORTED_ELEMENTS:
                 raise NotEditableError(f"it has an element <{tag.name}>")
+        # By order.
         bodies: list[XmlElement] = []
         joints: list[XmlElement] = []
         for world in self.find_elements("worldbody"):
@@ -103,12 +105,14 @@ class MjcfDocument:
         actuators = [
             child for tag in self.find_elements("actuator") for child in self.children(tag)
         ]
-        tags_by_element = {ModelElement("body", i + 1): tag for i, tag in enumerate(bodies)}
+        # Body 0 is the world.
+        tags_by_element = {ModelElement("body", i): tag for i, tag in enumerate(bodies, start=1)}
         tags_by_element |= {ModelElement("joint", i): tag for i, tag in enumerate(joints)}
         tags_by_element |= {ModelElement("actuator", i): tag for i, tag in enumerate(actuators)}
         _check_elements_match_model(
             tags_by_element, model, (len(bodies) + 1, len(joints), len(actuators))
         )
+        # By name.
         pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         pair_ids = {
             frozenset(str(model.geom(geom).name) for geom in geoms): i
@@ -136,14 +140,14 @@ class MjcfDocument:
     def _collect_bodies(
         self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]
     ) -> None:
-        """Collect bodies depth first, and the joints of each body before those of its children.
+        """Collect the bodies and joints below a body, in the order in which MuJoCo numbers them.
 
-        MuJoCo numbers bodies and joints in this order.
+        It is depth first; the joints of a body come before those of its child bodies.
 
         Args:
-            tag: Body whose children are collected.
-            bodies: List to which bodies are appended.
-            joints: List to which joints are appended.
+            tag: the body, whose own joints are included.
+            bodies: list to which bodies are appended.
+            joints: list to which joints are appended.
         """
         child_bodies: list[XmlElement] = []
         self._append_children(tag, child_bodies, joints)
@@ -154,9 +158,14 @@ class MjcfDocument:
     def _append_children(
         self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]
     ) -> None:
-        """Append the bodies and joints directly within a body to the two lists, in document order.
+        """Append the bodies and joints directly within a body to two lists, in document order.
 
-        A frame only groups its contents, so they count as contents of the body.
+        An element ``<frame>`` only groups its contents, so they count as contents of the body.
+
+        Args:
+            tag: the body, or a frame in it.
+            bodies: list to which child bodies are appended.
+            joints: list to which joints are appended.
         """
         for child in self.children(tag):
             if child.name == "body":
@@ -167,7 +176,9 @@ class MjcfDocument:
                 self._append_children(child, bodies, joints)
 
     def make_paths_absolute(self, folder: Path) -> bool:
-        """Make asset folders absolute, so that the text can be loaded from anywhere.
+        """Make the folders of assets absolute, so that the text can be loaded from anywhere.
+
+        Without asset files, nothing is changed.
 
         Args:
             folder: folder of the model file.
@@ -184,9 +195,13 @@ class MjcfDocument:
         return has_files
 
     def _write_absolute_folders(self, folder: Path) -> None:
-        """Write absolute mesh and texture folders, so that the document can be stored elsewhere.
+        """State absolute mesh and texture folders, so that the document can be stored elsewhere.
 
-        `folder` is the folder of the model file; the stated directories are relative to it.
+        They are written into the last compiler element, or into a new one. The folder of meshes or
+        textures is that of its own attribute, else ``assetdir``, else that of the model file.
+
+        Args:
+            folder: folder of the model file, to which stated folders are relative.
         """
         stated_folders: dict[str, str] = {}
         compilers = self.find_elements("compiler")
@@ -213,10 +228,14 @@ class MjcfDocument:
         return self.main.to_text().decode()
 
     def _prepare_includes(self, root: XmlElement) -> None:
-        """Prepare each include element for writing, included files first.
+        """Prepare each include element below an element for writing.
 
         A changed file is inserted in place of its include element, between two comments. An
-        unchanged file stays included, with its absolute path.
+        unchanged file stays included, with its absolute path. Files that an included file includes
+        are prepared before it, since they may change it.
+
+        Args:
+            root: root element of a file.
         """
         for tag in root.walk():
             inner = self._included.get(tag)
@@ -250,7 +269,8 @@ def _check_elements_match_model(
     compiled_counts = (model.nbody, model.njnt, len(model.actuator_ctrlnum))
     if counts != compiled_counts:
         raise NotEditableError("the compiled model has other elements")
-    for (kind, i), tag in tags_by_element.items():
-        name = str(getattr(model, kind)(i).name)
+    for (kind, number), tag in tags_by_element.items():
+        # The model has methods with the names of the kinds: body, joint and actuator.
+        name = str(getattr(model, kind)(number).name)
         if tag.attributes.get("name", "") != name:
             raise NotEditableError(f"the compiled model has its elements in another order ({name})")

@@ -80,8 +80,12 @@ class MjcfWriter:
         actuators may need another element name.
 
         Args:
-            statement: element with the attributes that change.
-            comments: reasons for the change, in sentences.
+            statement: element with the attributes that change; without any, only comments are
+                written.
+            comments: reasons for the change.
+
+        Raises:
+            NotEditableError: a geom or pair is not found in the text.
         """
         element = statement.element
         if element.kind == "option":
@@ -109,6 +113,8 @@ class MjcfWriter:
 
     def _write_option(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
         """Write global options, such as gravity, into the last option element or a new one.
+
+        The last element takes precedence over earlier ones.
 
         Args:
             statement: values of the options.
@@ -139,28 +145,31 @@ class MjcfWriter:
         Only attributes whose value changes are written, or all of them if the statement insists on
         it. Other forms of the inertial's orientation are removed, because new principal moments
         come with their own quaternion.
+
+        Args:
+            body: element of the body.
+            statement: all attributes of the inertial; none if there are only comments.
+            comments: comments to write before the inertial, or without one before the body.
         """
         values = format_attributes(statement.values)
-        for child in self.document.children(body):
-            if child.name == "inertial":
-                _add_comments(child, comments)
-                if not values:
-                    return
-                before = self._list_attributes_before(statement.element)
-                changed = {
-                    name for name, target in statement.values.items() if target != before[name]
-                }
-                if statement.insisted:
-                    changed = set(values)
-                if "diaginertia" in changed:
-                    changed |= {"quat"}
-                    child.removed |= set(_ORIENTATION_ATTRIBUTES)
-                child.new |= {name: values[name] for name in values if name in changed}
-                return
-        if not values:
+        inertials = [child for child in self.document.children(body) if child.name == "inertial"]
+        if not inertials and not values:
             _add_comments(body, comments)
-            return
-        body.within.append((list(comments), format_element("inertial", values)))
+        elif not inertials:
+            body.within.append((list(comments), format_element("inertial", values)))
+        else:
+            inertial = inertials[0]
+            _add_comments(inertial, comments)
+            before = self._list_attributes_before(statement.element)
+            changed = {
+                name
+                for name, target in statement.values.items()
+                if statement.insisted or target != before[name]
+            }
+            if "diaginertia" in changed:
+                changed |= {"quat"}
+                inertial.removed |= set(_ORIENTATION_ATTRIBUTES)
+            inertial.new |= {name: values[name] for name in values if name in changed}
 
     def _list_attributes_before(self, element: ModelElement) -> Mapping[str, Values]:
         return list_all_attributes(self.model, element, copy_model_fields(self.model))
@@ -170,10 +179,14 @@ class MjcfWriter:
 
         The attribute springdamper would override stiffness and damping, so it is set to
         zero with them.
+
+        Args:
+            tag: element of the joint; without a type it is a hinge.
+            statement: attribute values to write, with angles in rad.
         """
         values = format_attributes(statement.values)
-        hinge = tag.get_attribute("type") in (None, "hinge")
-        for name in ANGLE_ATTRIBUTES & set(statement.values) if hinge and self.degrees else ():
+        is_in_degrees = self.degrees and tag.get_attribute("type") in (None, "hinge")
+        for name in ANGLE_ATTRIBUTES & set(statement.values) if is_in_degrees else ():
             values[name] = format_number(float(np.rad2deg(statement.values[name][0])))
         if {"damping", "stiffness"} & set(values) and tag.get_attribute("springdamper"):
             values["springdamper"] = "0 0"
@@ -182,9 +195,11 @@ class MjcfWriter:
     def _format_actuator(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
         """Return the attributes of an actuator as text; rename its element if it must be renamed.
 
-        Element names such as ``position`` or ``motor`` are shortcuts for a general actuator. If the
-        shortcut can state the wanted values, it is kept. Otherwise the element becomes ``general``
-        with all the attributes that the shortcut implied.
+        Element names such as ``position`` or ``motor`` are shortcuts for a general actuator:
+
+        * If the shortcut can state the wanted values, it is kept, with its gains.
+        * Otherwise the element becomes ``general`` with all the attributes that the shortcut
+          implied.
 
         Args:
             tag: element of the actuator in the text; its name may be changed.
@@ -192,6 +207,7 @@ class MjcfWriter:
         """
         changed = statement.values
         before = {} if statement.insisted else self._list_attributes_before(statement.element)
+        # 1. The shortcut is kept.
         gains = _format_shortcut(
             tag.name,
             list_all_attributes(self.model, statement.element, self.wanted),
@@ -205,6 +221,7 @@ class MjcfWriter:
                 format_attributes({k: v for k, v in changed.items() if k not in _GAIN_ATTRIBUTES})
                 | gains
             )
+        # 2. The element becomes ``general``, or is already.
         if tag.name != "general":
             tag.renamed = "general"
             tag.removed |= set(SHORTCUT_ATTRIBUTES)
@@ -232,9 +249,14 @@ def _format_shortcut(
 ) -> dict[str, str] | None:
     """Return the gains of an actuator shortcut as attributes; None if it cannot express the values.
 
-    A position actuator has force = kp (u - l) - kv l', and a velocity actuator kv (u - l'), with
-    the control u and the actuator's position l. MuJoCo stores force = gain u + offset
-    + stiffness l + damping l', so a position actuator needs offset = 0 and stiffness = -gain.
+    MuJoCo stores force = gain u + offset + stiffness l + damping l' with the control u and the
+    actuator's position l. The cases are:
+
+    * A type or a filter changes: no shortcut can express it.
+    * No gain changes: no attributes are needed.
+    * ``position`` has force = kp (u - l) - kv l', so offset = 0 and stiffness = -gain.
+    * ``velocity`` has force = kv (u - l'), so offset = stiffness = 0 and damping = -gain.
+    * Otherwise, and for other shortcuts, the values cannot be expressed.
 
     Args:
         name: name of the shortcut, such as ``position``.
@@ -243,7 +265,7 @@ def _format_shortcut(
         before: attribute values of the document; empty if all must be written.
 
     Returns:
-        The attributes; None if the shortcut cannot express the values.
+        The attributes kp and kv that change; None if the shortcut cannot express the values.
     """
     if set(changed) & {"dyntype", "dynprm", "gaintype", "biastype"}:
         return None
@@ -271,7 +293,10 @@ def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
 
 
 def _format_values(name: str, values: tuple[float, ...]) -> str:
-    """Format the numbers of an attribute for MJCF: word, true or false, integer or list.
+    """Format the numbers of an attribute for MJCF, as its kind demands.
+
+    An enumeration becomes a word, a flag ``true`` or ``false``, a count an integer; all others are
+    a number or a list of numbers.
 
     Args:
         name: name of the attribute.
@@ -314,6 +339,7 @@ def format_spec(spec: Any, folder: Path) -> str:
     spec.texturedir = str(folder / spec.texturedir)
     spec.compiler.savecompiled = False
     spec.compiler.savecanonical = False
+    # The number of digits is a setting of MuJoCo's library, which is restored afterwards.
     library = _load_library()
     try:
         digits = library._mjPRIVATE__get_xml_precision()
@@ -332,17 +358,20 @@ def _load_library() -> Any:
     import mujoco
 
     folder = Path(mujoco.__file__).parent
-    names = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")
-    (path, *_) = [library_path for name in names for library_path in sorted(folder.glob(name))]
+    patterns = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")  # Linux, macOS, Windows
+    path, *_ = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
     return ctypes.CDLL(str(path))
 
 
 def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
     """Return the text of the model file with the elements that causes add, and a fixed base.
 
-    These elements are joints in series (second joints of flexible or slack drives), tendons of
-    coupled drives, and pairs of geoms with contact parameters of their own. Their numbers are
-    written afterwards. Without any of them, the text is unchanged.
+    1. For a base that a recording fixes, remove free joints and keyframes.
+    2. Add tendons of coupled drives.
+    3. Add pairs of geoms with contact parameters of their own.
+    4. Add joints in series (second joints of flexible or slack drives).
+
+    Other numbers are written afterwards. Without any of these elements, the text is unchanged.
 
     Args:
         robot: robot with the added elements.
@@ -356,14 +385,17 @@ def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
     if not robot.series and not robot.coupled and not has_fixed_base and not robot.spec.pairs:
         return text
     document = MjcfDocument(text, robot.path)
-    # Free joints and keyframes are removed, as by `parsing.floating_bases.fix_bases`.
+    # 1. As by `parsing.floating_bases.fix_bases`.
     for tag in document.walk() if has_fixed_base else ():
         is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
         if tag.name in ("freejoint", "keyframe") or is_free:
             tag.text = b""
+    # 2. Tendons.
     if robot.coupled:
         _write_couplings(document, robot, model)
+    # 3. Pairs.
     _add_pairs(document, robot)
+    # 4. Joints in series, each after the joint of its drive.
     tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
     for series_joint in (joint for joint in robot.spec.joints if joint.name in robot.series):
         joint_tag = tags.get(series_joint.name.rpartition("_")[0])
@@ -374,10 +406,10 @@ def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
 
 
 def _write_couplings(document: MjcfDocument, robot: RobotModel, model: Any) -> None:
-    """Write the couplings of joints: a fixed tendon for each, which the joint's actuators drive.
+    """Write the couplings of drives: a fixed tendon for each, which the joint's actuators drive.
 
-    The length of the tendon is q + c q_first, with the coefficient c and the preceding joint
-    q_first.
+    The length of the tendon is q + c q_first, with the position q of the drive's joint, that of the
+    preceding joint q_first, and the coefficient c.
 
     Args:
         document: the MJCF, changed in place.
@@ -435,10 +467,13 @@ def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
 
 
 def _render_series_joint(second: Any) -> str:
-    """Render a joint in series as an MJCF element, with all attributes stated.
+    """Render a joint that is added in series with another one as an MJCF element.
 
-    The file's default classes then have no influence on it. `is_limited` is whether its range is
-    limited, which represents backlash.
+    All attributes are stated, so that the file's default classes have no influence on it. A limited
+    range represents backlash.
+
+    Args:
+        second: joint of the `mujoco.MjSpec`.
     """
     kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
     is_limited = str(second.limited).endswith("TRUE")

@@ -11,10 +11,9 @@ _IGNORED_NAME_PARTS = ("name", "path", "text", "signature", "tex_data", "nbuffer
 
 
 def find_first_difference(first_model: Any, second_model: Any, tolerance: float) -> str | None:
-    """Find the first field in which two compiled models differ.
+    """Find the first field, in alphabetical order, in which two compiled models differ.
 
-    This shows that a written model file describes the same robot. All numeric fields and options
-    are compared; names and other texts are ignored.
+    All numeric fields and options are compared; names and other texts are ignored.
 
     Args:
         first_model: a mujoco.MjModel.

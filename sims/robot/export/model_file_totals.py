@@ -38,17 +38,15 @@ It takes the model fields, the robot and the place.
 def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # noqa: ARG001
     """Return the component of gravity along its direction in the file, in a list of one, m/s^2.
 
-    All readers have the same arguments.
-
     Args:
         f: fields of the model with the effects.
         robot: the robot, whose file specifies the direction.
-        place: unused.
+        place: unused; all readers have the same arguments.
     """
     gravity_in_file = robot.compiled.opt.gravity
-    return [
-        float(f["opt.gravity"][0] @ gravity_in_file / max(np.linalg.norm(gravity_in_file), 1e-300))
-    ]
+    # Gravity may be zero in the file.
+    magnitude = max(np.linalg.norm(gravity_in_file), 1e-300)
+    return [float(f["opt.gravity"][0] @ gravity_in_file / magnitude)]
 
 
 def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
@@ -65,10 +63,13 @@ def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float
 
 
 def _make_solref_reader(index: int) -> Read:
-    """Return a reader of the time constant (0) or damping ratio (1) of a contact.
+    """Return a function that reads the time constant or the damping ratio of a contact.
 
-    MuJoCo's `solref` has these two numbers, or stiffness and damping if they are negative; the
-    number is then infinite, thus no number of the file.
+    MuJoCo's `solref` has these two numbers, or the negative stiffness and damping. The function
+    returns infinity in the second case, which stands for a number that the file does not have.
+
+    Args:
+        index: 0 for the time constant, 1 for the damping ratio.
     """
 
     def read(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
@@ -122,6 +123,7 @@ def compute_file_totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | 
     Returns:
         For each effect, one entry per coefficient; None if the file has no such number.
     """
+    # A contact has numbers of its own only with an element `<pair>`.
     robot = add_contact_pairs(robot, [e.place for e, _ in fitted if e.at == "contact"])
     file_fields = copy_model_fields(robot.compiled)
     changed_fields = copy_model_fields(robot.compiled)
@@ -144,10 +146,12 @@ def _get_effect_name(effect: type[Effect]) -> str:
 
 
 def _read_numbers(fields: Fields, robot: RobotModel, effect: type[Effect]) -> Sequence[float]:
-    """Return the numbers that an effect's coefficients change; empty if the file has none.
+    """Return the numbers of the model file that an effect's coefficients change, one for each.
+
+    The result is empty if the file has no such numbers.
 
     Args:
-        fields: fields of the model.
+        fields: fields of the model, from which the numbers are read.
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         effect: class of the effect at its place.
     """
@@ -156,8 +160,8 @@ def _read_numbers(fields: Fields, robot: RobotModel, effect: type[Effect]) -> Se
         return _READERS[name](fields, robot, place)
     # The largest of three principal moments represents a tensor.
     return [
-        main.sign * np.max(fields[main.name][(0, *main.address)])
-        for main, *_ in model_fields(robot, name, place)
+        main_field.sign * np.max(fields[main_field.name][(0, *main_field.address)])
+        for main_field, *_ in model_fields(robot, name, place)
     ]
 
 
@@ -166,28 +170,30 @@ def _list_totals(
 ) -> list[Total | None]:
     """Return the numbers of the model file that one effect changes, before and after.
 
-    An example is a damping of 0.1 in the file and an effect of 0.2: the total is 0.3. The entry of
-    a coefficient is None where the file has no such number, or an infinite one. Units at a slide
-    joint may differ from those at a hinge.
+    An example is a damping of 0.1 in the file and an effect of 0.2: the total is 0.3.
 
     Args:
         robot: model of the robot as read from its file.
         effect: effect at one place.
         count: number of coefficients.
         file_fields: fields of the model file.
-        changed_fields: fields with the effect.
+        changed_fields: fields with all fitted effects.
+
+    Returns:
+        One entry for each coefficient; None where the file has no such number, or an infinite one.
     """
-    pairs = [
-        np.array(_read_numbers(f, robot, effect), dtype=float)
-        for f in (file_fields, changed_fields)
-    ]
-    if not pairs[0].size:
+    file_numbers, totals = (
+        np.array(_read_numbers(fields, robot, effect), dtype=float)
+        for fields in (file_fields, changed_fields)
+    )
+    if not file_numbers.size:
         return [None] * count
     hinge_unit, slide_unit = _UNITS.get(_get_effect_name(effect), ("", ""))
     joint = robot.actuator(effect.place).joint if effect.at == "actuator" else None
     is_at_slide = joint is not None and robot.joint(joint).kind == "slide"
     number_totals: list[Total | None] = []
-    for c, before, total in zip(effect.coefficients, *pairs, strict=True):
+    for c, before, total in zip(effect.coefficients, file_numbers, totals, strict=True):
+        # Without a unit for this effect, the number has that of the coefficient.
         unit = (slide_unit if is_at_slide else "") or hinge_unit or c.units[0]
         is_stated = np.isfinite([before, total]).all()
         number_totals.append(Total(float(before), float(total), unit or "1") if is_stated else None)

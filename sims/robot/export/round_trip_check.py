@@ -86,12 +86,16 @@ def check_written_files(
 def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
     """Check that a written URDF loads as the model with all causes that a URDF can express.
 
-    The steps are:
-
     1. Apply the causes that a URDF can state to the original model.
     2. Load the written URDF.
-    3. Compare fields, inertia tensors and a test motion. Contacts and friction stiffness, which a
-       URDF cannot state, are left out.
+    3. Compare fields and inertia tensors.
+    4. Compare a test motion, without contacts, and with equal friction stiffness, which a URDF
+       cannot state.
+
+    Args:
+        robot: robot as read from its model file, which is read again.
+        causes: coefficients of all causes.
+        path: path of the written URDF.
 
     Raises:
         RuntimeError: fields, inertia tensors or the motion differ.
@@ -101,7 +105,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     from sims.robot.export.urdf_writer import UrdfWriter
     from sims.robot.parsing.read_model_file import read_robot
 
-    # 1. Original model with the causes.
+    # 1. Original model with the causes. A writer tells which of them a URDF can state.
     writer = UrdfWriter(robot, "")
     urdf_causes = {}
     for cause in expand_families(robot, causes):
@@ -112,8 +116,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     release_free_memory()
     # 2. Written URDF.
     reloaded_model = read_robot(path).compiled
-    # 3. Comparison.
-    # The axes of two equal moments are arbitrary, so whole tensors are compared.
+    # 3. Fields. The axes of two equal moments are arbitrary, so whole tensors are compared.
     reloaded_tensors, target_tensors = (
         compute_inertia_tensors(m.body_iquat, m.body_inertia)
         for m in (reloaded_model, target_model)
@@ -133,9 +136,8 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
             atol=max(tolerance, EQUAL_NUMBERS_TOLERANCE),
         ):
             raise RuntimeError(f"extended.urdf differs from the intended model: {name}")
+    # 4. Motion. Colliding shapes may be meshes in other folders.
     for model in (target_model, reloaded_model):
-        # A URDF does not specify the stiffness of friction, and colliding shapes may be meshes
-        # elsewhere.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         for name in _UNCOMPARED_FIELDS:
             getattr(model, name)[:] = getattr(reloaded_model, name)
@@ -145,7 +147,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
 def _compare_motion(reloaded_model: Any, target_model: Any, name: str) -> None:
     """Check that two models move alike in a short test simulation from the same pose.
 
-    This detects differences that a comparison of fields misses or cannot make.
+    This detects differences in fields that are not compared, and swapped elements.
 
     Args:
         reloaded_model: model compiled from the written file.
@@ -155,7 +157,8 @@ def _compare_motion(reloaded_model: Any, target_model: Any, name: str) -> None:
     Raises:
         RuntimeError: the positions differ by more than `MOTION_TOLERANCE`.
     """
-    # A URDF states a joint's zero as a turned frame, so that its reference pose is another one.
+    # The reference poses may differ, since a URDF states a moved zero of a joint as a turned frame.
+    # So one pose is used for both.
     pose = displace_reference_pose(target_model)
     reloaded_motion = simulate_test_motion(reloaded_model, pose)
     target_motion = simulate_test_motion(target_model, pose)
@@ -167,14 +170,12 @@ def _compare_motion(reloaded_model: Any, target_model: Any, name: str) -> None:
 
 
 def displace_reference_pose(model: Any) -> Array:
-    """Return a pose (nq,) near the reference pose, with different displacements of all joints.
+    """Return a pose (nq,) near the reference pose of a compiled model, for a test motion.
 
-    Args:
-        model: Compiled model of MuJoCo.
+    All coordinates have different displacements, so that swapped ones are detected.
     """
     import mujoco
 
-    # Different values detect swapped coordinates.
     pose: Array = model.qpos0.copy()
     displacements = MEAN_DISPLACEMENT + DISPLACEMENT_AMPLITUDE * np.sin(np.arange(model.nv))
     mujoco.mj_integratePos(model, pose, displacements, 1.0)
@@ -182,16 +183,17 @@ def displace_reference_pose(model: Any) -> Array:
 
 
 def simulate_test_motion(model: Any, pose: Array | None = None) -> Array:
-    """Simulate a test motion (S, nq) with nonzero controls.
+    """Simulate a test motion with nonzero controls.
 
     Each actuator has a constant control within its range, different for each actuator, so that
     swapped actuators change the motion.
 
-    Shapes: S steps.
-
     Args:
         model: the mujoco.MjModel.
         pose: initial pose (nq,); that of `displace_reference_pose` by default.
+
+    Returns:
+        (S, nq) positions after each of S steps.
     """
     import mujoco
     from mujoco import rollout
@@ -201,12 +203,14 @@ def simulate_test_motion(model: Any, pose: Array | None = None) -> Array:
     low, high = model.actuator_ctrlrange.T
     middle, half_range = (low + high) / 2.0, (high - low) / 2.0
     is_limited = model.actuator_ctrllimited.astype(bool)
-    signs = 0.5 * np.cos(np.arange(model.nu))
-    control = np.where(is_limited, middle + half_range * signs, signs)
+    # Between -0.5 and 0.5: a share of half the range, or the control itself without a range.
+    shares = 0.5 * np.cos(np.arange(model.nu))
+    control = np.where(is_limited, middle + half_range * shares, shares)
     steps = min(int(COMPARED_SECONDS / model.opt.timestep), MAX_COMPARED_STEPS)
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     controls = np.tile(control, (1, steps, 1))
     states, _ = rollout.rollout(model, data, state, controls)
+    # A full state begins with the time, followed by the positions.
     result: Array = states[0, :, 1 : 1 + model.nq]
     return result

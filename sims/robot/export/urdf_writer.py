@@ -123,12 +123,16 @@ class UrdfWriter:
         return self.joints[cause.place]
 
     def _find_inertials(self, cause: FittedCause) -> list[tuple[str, XmlElement]]:
-        """Return the links of a body that have a mass, with their inertials.
+        """Return the links of a body that have a mass, by name, with their inertials.
 
-        A link without mass, such as a frame that carries others on fixed joints, adds nothing.
+        A body consists of a link and those that are fused to it by fixed joints. A link without
+        mass and shapes, such as a mere frame, is left out.
+
+        Args:
+            cause: effect on the body.
 
         Raises:
-            UnstatableCauseError: The mass of a link follows from its shapes, or no link has a mass.
+            UnstatableCauseError: the mass of a link follows from its shapes, or no link has a mass.
         """
         body = self.robot.body(cause.place)
         inertials = []
@@ -138,6 +142,7 @@ class UrdfWriter:
             if inertial is not None:
                 inertials += [(name, inertial)] if _has_mass(inertial) else []
             elif link is None or _find_child(link, "collision"):
+                # The mass of the whole body is not stated.
                 inertials = []
                 break
         if not inertials:
@@ -151,8 +156,12 @@ class UrdfWriter:
     def _write_inertia_tensor(self, cause: FittedCause) -> None:
         """Scale the inertia tensor of the body's only link by 1 + c; its mass stays.
 
-        A body of several links is refused: its tensor includes the distances between the
-        links, which no change of the links' own tensors would scale.
+        Args:
+            cause: effect on a body, with the coefficient c.
+
+        Raises:
+            UnstatableCauseError: the body consists of several links, whose distances contribute to
+                its tensor and cannot be scaled; or its mass is not stated.
         """
         if len(self._find_inertials(cause)) > 1:
             raise UnstatableCauseError("the body is not one link with an inertial")
@@ -161,11 +170,12 @@ class UrdfWriter:
     def _scale_inertials(
         self, cause: FittedCause, attributes: Mapping[str, tuple[str, ...]]
     ) -> None:
-        """Multiply stated attributes of the inertials of a body by 1 + c.
+        """Multiply stated attributes of the inertials of a body's links by 1 + c.
 
         Args:
-            cause: Effect on the body, with the coefficient c.
-            attributes: Attributes to multiply, by child element; those not stated stay so.
+            cause: effect on the body, with the coefficient c.
+            attributes: names of the attributes by child element of an inertial, such as the value
+                of the mass; those that are not stated stay so.
         """
         factor = float(compute_factor(cause.coefficients[0]))
         for _, inertial in self._find_inertials(cause):
@@ -178,10 +188,13 @@ class UrdfWriter:
                         child.new[key] = format_number(float(value) * factor)
 
     def _write_centre_of_mass(self, cause: FittedCause) -> None:
-        """Move the centre of mass of each link in the body by the same vector c in metres.
+        """Move the centre of mass of each link in the body by the same vector.
 
         A body may consist of several links that are fused by fixed joints. In the frame of a link,
-        whose axes in the frame of the body are R, the vector is R' c (2).
+        whose axes in the frame of the body are R, the vector c is R' c (2).
+
+        Args:
+            cause: effect on a body with the coefficients c in m, in the frame of the body.
         """
         inertials = self._find_inertials(cause)
         body = self.robot.body(cause.place).name
@@ -193,12 +206,16 @@ class UrdfWriter:
     def _write_joint_zero(self, cause: FittedCause) -> None:
         """Move the zero of a joint by c (rad or m).
 
-        URDF cannot state a zero. It moves by c if the origin of the joint is turned by -c about its
-        axis, or moved by -c along it if the joint is prismatic (3).
+        URDF has no attribute for it. The zero moves by c if the origin of the joint is turned by -c
+        about its axis, or moved by -c along it if the joint is prismatic (3).
+
+        Args:
+            cause: effect at a joint with the coefficient c.
         """
         joint = self._find_joint(cause)
         (c,) = cause.coefficients
         self._add_comment(joint, cause)
+        # The axis is stated in the frame of the joint, and the origin in that of the parent link.
         axis = _get_joint_axis(joint)
         axes = _compute_rotation(_read_origin(joint, "rpy"))
         if joint.get_attribute("type") == "prismatic":
@@ -217,28 +234,44 @@ class UrdfWriter:
     def _write_link_length(self, cause: FittedCause) -> None:
         """Lengthen a link by the share c: move the joint that carries the body.
 
-        With the position p of the body in the frame of its parent body (`carrier`), the joint's
-        origin moves by c p. In the frame of the joint's parent link, whose axes in the parent body
-        are R (`axes`), this is R' c p (4).
+        With the position p of the body in the frame of its parent body, the joint's origin moves by
+        c p. In the frame of the joint's parent link, whose axes in the parent body are R, this is
+        R' c p (4).
+
+        Args:
+            cause: effect on a body with the coefficient c.
+
+        Raises:
+            UnstatableCauseError: no joint of the file carries the body.
         """
         body, model = self.robot.body(cause.place), self.robot.compiled
         joints = [tag for tag in self.joints.values() if _get_link_name(tag, "child") == body.name]
         if not joints:
             raise UnstatableCauseError("the file has no joint that carries the link")
-        carrier = model.body(int(model.body_parentid[body.id])).name
-        axes = self._get_link_axes(_get_link_name(joints[0], "parent"), carrier)
-        displacement = axes.T @ model.body_pos[body.id] * cause.coefficients[0]  # (4)
-        self._add_comment(joints[0], cause)
-        _set_vector(joints[0], "origin", "xyz", _read_origin(joints[0], "xyz") + displacement)
+        joint, (c,) = joints[0], cause.coefficients
+        parent_body = model.body(int(model.body_parentid[body.id])).name
+        axes = self._get_link_axes(_get_link_name(joint, "parent"), parent_body)
+        displacement = axes.T @ model.body_pos[body.id] * c  # (4)
+        self._add_comment(joint, cause)
+        _set_vector(joint, "origin", "xyz", _read_origin(joint, "xyz") + displacement)
 
     def _write_payload(self, cause: FittedCause) -> None:
-        """Add a payload, a point mass, to a link: new mass, centre of mass, and inertia tensor.
+        """Add a payload, a point mass, to the first link of a body.
 
-        The coefficients are the mass `added_mass` in kg and its offset from the body's centre of
-        mass in m. The inertia tensor is turned to the axes of the link, increased by the parallel
-        axis theorem to that about the common centre of mass `middle` (5), and turned back to the
-        axes of the inertial, in which it is written.
+        1. Read mass, centre of mass and inertia tensor of the link. The tensor is about the centre
+           of mass, in the axes of the inertial.
+        2. Compute the common centre of mass. Turn the tensor to the axes of the link, increase it
+           by the parallel axis theorem to that about the common centre (5), and turn it back.
+        3. Write the new numbers.
+
+        Args:
+            cause: effect on a body; its coefficients are the mass of the payload in kg, and its
+                offset x, y, z from the body's centre of mass in m.
+
+        Raises:
+            UnstatableCauseError: the file does not state mass and inertia of the link.
         """
+        # 1. Numbers of the link.
         body = self.robot.body(cause.place)
         link = self.links.get(body.name)
         inertial = _find_child(link, "inertial") if link else None
@@ -249,26 +282,31 @@ class UrdfWriter:
             raise UnstatableCauseError("the link's inertial lacks a mass or an inertia")
         mass = float(mass_tag.get_attribute("value") or 0.0)
         added_mass, *offset = cause.coefficients
-        point = self.robot.compiled.body_ipos[body.id] + offset
+        payload_position = self.robot.compiled.body_ipos[body.id] + offset
         centre = _read_origin(inertial, "xyz")
         axes = _compute_rotation(_read_origin(inertial, "rpy"))
         values = [float(tensor_tag.get_attribute(key) or 0.0) for key in _TENSOR_ATTRIBUTES]
         tensor = np.zeros((3, 3))
         tensor[np.triu_indices(3)] = values
         tensor += np.triu(tensor, 1).T  # makes it symmetric
-        middle = (mass * centre + added_mass * point) / (mass + added_mass)
+        # 2. Link and payload.
+        common_centre = (mass * centre + added_mass * payload_position) / (mass + added_mass)
         tensor = axes @ tensor @ axes.T
-        arms = np.stack([centre - middle, point - middle])
+        arms = np.stack([centre - common_centre, payload_position - common_centre])
         tensor += np.einsum("n,nij->ij", [mass, added_mass], compute_point_inertias(arms))  # (5)
         tensor = axes.T @ tensor @ axes
+        # 3. New numbers.
         self._add_comment(inertial, cause)
         mass_tag.new["value"] = format_number(mass + added_mass)
         for key, value in zip(_TENSOR_ATTRIBUTES, tensor[np.triu_indices(3)].tolist(), strict=True):
             tensor_tag.new[key] = format_number(value)
-        _set_vector(inertial, "origin", "xyz", middle)
+        _set_vector(inertial, "origin", "xyz", common_centre)
 
     def _get_link_axes(self, link: str, body: str) -> Array:
-        """Return the axes (3, 3) of a link in the frame of the body into which it is fused."""
+        """Return the axes (3, 3) of a link in the frame of the body into which it is fused.
+
+        The rotations of the fixed joints between them are multiplied.
+        """
         axes = np.eye(3)
         while link != body:
             (joint,) = [tag for tag in self.joints.values() if _get_link_name(tag, "child") == link]

@@ -72,8 +72,11 @@ def write_model_files(
 ) -> WrittenModelFiles:
     """Write causes into the robot's own model file.
 
-    An MJCF keeps its text and gets changed attributes. If this is impossible, or for a URDF,
-    MuJoCo writes the MJCF; a URDF is written in addition, with the causes that it can state.
+    * An MJCF keeps its text and gets changed attributes.
+    * If this is impossible, because its text generates elements, or because a recording adds
+      actuators, MuJoCo writes the MJCF.
+    * For a URDF, MuJoCo writes an MJCF; a URDF is written in addition, with the causes that it can
+      state.
 
     Args:
         robot: robot as read from its model file.
@@ -108,6 +111,8 @@ def _render_urdf(
     robot: RobotModel, causes: CauseCoefficients, recording: str, notes: list[str]
 ) -> str | None:
     """Render the URDF with the causes that it can express, and add notes about all others.
+
+    The result is None if its text cannot be edited.
 
     Args:
         robot: the robot as read from its URDF.
@@ -166,8 +171,11 @@ class MjcfEditor:
         """Return the text with all wanted attributes, checked by compiling it.
 
         MuJoCo derives its numbers from attributes in many ways, so a change may have no effect, or
-        change other numbers too. So the attributes are written, the text is compiled, and what
-        still differs is written as well, for at most `MAX_CORRECTION_ROUNDS` rounds.
+        change other numbers too. So in each of at most `MAX_CORRECTION_ROUNDS` rounds:
+
+        1. Find the attributes whose numbers in the compiled text differ from the wanted ones, and
+           add them to those that are to be written.
+        2. Write all of them into the original text, and compile it.
 
         Raises:
             NotEditableError: the edited text does not compile to the wanted model.
@@ -176,17 +184,20 @@ class MjcfEditor:
         statements = {element: AttributeStatement(element) for element in self.applied.comments}
         model = self.original
         for _ in range(MAX_CORRECTION_ROUNDS):
+            # 1. Differences.
             for statement in find_missing_statements(
                 model, self.applied.target_values, ROUNDING_TOLERANCE
             ):
                 element_statement = statements.setdefault(
                     statement.element, AttributeStatement(statement.element)
                 )
-                # Attributes that were written without effect need their related attributes.
+                # Attributes that were written without effect, or that another change has altered,
+                # need their related attributes.
                 element_statement.insisted = (
                     bool(element_statement.values) or model is not self.original
                 )
                 element_statement.values |= statement.values
+            # 2. New text.
             text = self._render_document(list(statements.values()))
             model = compile_mjcf(text)
             if not find_missing_statements(model, self.applied.target_values, ROUNDING_TOLERANCE):
@@ -199,7 +210,11 @@ class MjcfEditor:
     def _render_document(self, statements: Sequence[AttributeStatement]) -> str:
         """Return the text of the document with the statements, their comments and a heading.
 
-        A statement without a cause of its own keeps a value that would change otherwise.
+        The comments of an element name the causes that change it. An element without a cause has a
+        statement because another change would alter it, and its comment says so.
+
+        Args:
+            statements: attribute values to write, by element.
         """
         document = self._parse_document()
         writer = MjcfWriter(document, self.original, self.applied.target_values)

@@ -54,7 +54,7 @@ class XmlElement:
 
     @property
     def has_changes(self) -> bool:
-        """True if the element or any of its descendants has changes."""
+        """True if the element or any of its descendants is to be written with changes."""
         has_tag_changes = self.new or self.removed or self.renamed or self.before or self.after
         has_content_changes = self.within or self.inserted or self.text is not None
         return bool(has_tag_changes or has_content_changes) or any(
@@ -117,7 +117,7 @@ class XmlText:
     def _handle_start_tag(self, name: str, attributes: dict[str, str]) -> None:
         """Add an element to the tree at its start tag (called by the parser).
 
-        Until its end tag is parsed, `inside` and `end` are the end of the start tag.
+        Its end is that of the start tag until the end tag is parsed.
         """
         tag = XmlElement(name, attributes, self._parser.CurrentByteIndex)
         tag.inside = tag.end = self._end_of(tag.begin)
@@ -138,20 +138,23 @@ class XmlText:
         return self.text[tag.inside - 2 : tag.inside] == b"/>"
 
     def _end_of(self, begin: int) -> int:
-        """Return the offset after a start tag, at the first ``>`` outside of quotes.
+        """Return the byte offset after a tag: after the first ``>`` that is not within quotes.
 
         Args:
-            begin: Offset of the ``<`` of the tag.
+            begin: offset of the ``<`` of the tag.
+
+        Raises:
+            NotEditableError: the text ends within the tag.
         """
-        quote = b""
-        for i in range(begin, len(self.text)):
-            character = self.text[i : i + 1]
+        quote = b""  # the quote that has been opened; empty outside of quotes
+        for offset in range(begin, len(self.text)):
+            character = self.text[offset : offset + 1]
             if quote:
                 quote = b"" if character == quote else quote
             elif character in (b'"', b"'"):
                 quote = character
             elif character == b">":
-                return i + 1
+                return offset + 1
         raise NotEditableError(f"{self.path.name} ends within a tag")
 
     def inner_text(self) -> bytes:
@@ -186,8 +189,12 @@ class XmlText:
         """Return the text of an element with its comments, changed attributes and new elements.
 
         The parts are, in order: comments before it, its start tag, inserted children, its own
-        content (rendered recursively), its end tag, and elements after it. All text that has not
-        changed is kept byte for byte.
+        content (rendered recursively), its end tag, and elements after it. If the element is
+        replaced by another text, only the comments and this text. All text that has not changed is
+        kept byte for byte.
+
+        Args:
+            tag: element with its changes.
 
         Raises:
             NotEditableError: new elements belong into an element with a self-closing tag.
@@ -198,11 +205,8 @@ class XmlText:
             return b"".join([*comments, tag.text])
         if self._is_self_closing(tag) and (tag.within or tag.inserted):
             raise NotEditableError(f"{tag.name} has nothing in it")
-        closing = (
-            self.text[tag.end : self._find_end_of_element(tag)]
-            if not self._is_self_closing(tag)
-            else b""
-        )
+        # A self-closing tag has no end tag, and `tag.end` is its end.
+        closing = self.text[tag.end : self._find_end_of_element(tag)]
         if tag.renamed:
             closing = closing.replace(tag.name.encode(), tag.renamed.encode(), 1)
         content = self._render_range(tag.inside, tag.end, tag.children)
@@ -216,9 +220,14 @@ class XmlText:
         return b"".join([*comments, *element_parts, *following_elements])
 
     def _render_inserted(self, tag: XmlElement, indent: bytes) -> bytes:
-        """Return the text of the elements inserted before all children.
+        """Return the text of the comments and elements that are inserted before all children.
 
-        Each comment and each element gets a line with the indentation of the other children.
+        Each gets a line with the indentation of the other children.
+
+        Args:
+            tag: element with `within` and `inserted`.
+            indent: indentation of the element itself; new children without others get two more
+                blanks.
         """
         child_indent = (
             self._get_indentation(tag.children[0].begin) if tag.children else indent + b"  "
@@ -226,10 +235,9 @@ class XmlText:
         fragments = []
         inserted = [(child.before, format_element(child.name, child.new)) for child in tag.inserted]
         for comments, element in [*tag.within, *inserted]:
-            for line in [
-                *map(self._render_comment, comments),
-                *([element.encode()] if element else []),
-            ]:
+            lines = [self._render_comment(comment) for comment in comments]
+            lines += [element.encode()] if element else []
+            for line in lines:
                 fragments += [self._newline + child_indent, line]
         return b"".join(fragments)
 
@@ -246,9 +254,10 @@ class XmlText:
         fragments = [b"<", (tag.renamed or tag.name).encode()]
         written_names = set()
         while attribute_match := _ATTRIBUTE.match(text, offset):
-            name = attribute_match[2].decode()
+            spaces, encoded_name, _ = attribute_match.groups()
+            name = encoded_name.decode()
             if name in tag.new:
-                fragments.append(attribute_match[1] + _render_attribute(name, tag.new[name]))
+                fragments.append(spaces + _render_attribute(name, tag.new[name]))
                 written_names.add(name)
             elif name not in tag.removed:
                 fragments.append(attribute_match[0])
