@@ -79,7 +79,11 @@ def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
 
 
 def find_geom(robot: RobotModel, name: str) -> int:
-    """Return the number of a geom.
+    """Return the number of a geom in the compiled model.
+
+    Args:
+        robot: robot with the geom.
+        name: name of the geom; unnamed ones are called ``geom3`` and so on.
 
     Raises:
         InputError: there is no such geom; the message lists the existing ones.
@@ -117,13 +121,13 @@ def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactPar
     has_direct_form = (solref[:, 0] <= 0).any()
     sliding, torsional, rolling = model.geom_friction[geom_rows].max(axis=0)
     return ContactParameters(
-        int(model.geom_condim[geom_rows].max()),
+        condim=int(model.geom_condim[geom_rows].max()),
         # A pair has two coefficients for the two tangents, and two for the rolling axes.
-        np.array([sliding, sliding, torsional, rolling, rolling]),
-        solref.min(axis=0) if has_direct_form else weights @ solref,
-        weights @ model.geom_solimp[geom_rows],
-        margin,
-        gap,
+        friction=np.array([sliding, sliding, torsional, rolling, rolling]),
+        solref=solref.min(axis=0) if has_direct_form else weights @ solref,
+        solimp=weights @ model.geom_solimp[geom_rows],
+        margin=margin,
+        gap=gap,
     )
 
 

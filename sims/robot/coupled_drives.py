@@ -78,7 +78,7 @@ def make_coupled_robot(robot: RobotModel, coefficients: Mapping[str, float]) -> 
 
     Args:
         robot: robot as read from its model file.
-        coefficients: c of eq. (1) by joint; the joints are among `list_coupling_places`.
+        coefficients: c by joint; the joints are among `list_coupling_places`.
     """
     import mujoco
 

@@ -62,20 +62,20 @@ class FloatingJoints:
     def from_robot(cls, robot: RobotModel) -> FloatingJoints:
         """Return the floating joints of a robot, with their addresses in `qpos` and `qvel`.
 
-        A free joint has a position and a quaternion in `qpos` (7 numbers), and a velocity and an
-        angular velocity in `qvel` (6). A ball joint has only the quaternion (4) and the angular
-        velocity (3).
+        A free joint has a position and a quaternion in `qpos`, 7 numbers, and a velocity and an
+        angular velocity in `qvel`, 6 numbers. A ball joint has only the quaternion and the angular
+        velocity.
         """
         joints = tuple(joint for joint in robot.joints if not joint.has_one_coordinate)
         positions = [
-            j.position + k
-            for j in joints
-            for k in range(len(_list_translation_axes(j) + QUATERNION_ENTRIES))
+            joint.position + k
+            for joint in joints
+            for k in range(len(_list_translation_axes(joint) + QUATERNION_ENTRIES))
         ]
         velocities = [
-            j.velocity + k
-            for j in joints
-            for k in range(len(_list_translation_axes(j) + ANGULAR_VELOCITY_AXES))
+            joint.velocity + k
+            for joint in joints
+            for k in range(len(_list_translation_axes(joint) + ANGULAR_VELOCITY_AXES))
         ]
         return cls(
             robot.compiled, joints, np.array(positions, np.intp), np.array(velocities, np.intp)

@@ -35,7 +35,7 @@ POSITION_TOLERANCE = 1e-10
 def close_loops(
     robot: RobotModel, states: Mapping[str, float], unmeasured: Collection[str]
 ) -> dict[str, float]:
-    """Place unmeasured joints of closed loops where the constraints put them, by eq. (1).
+    """Place unmeasured joints of closed loops where the constraints put them.
 
     The constraints of the loops are r(q) = 0, with J = dr/dq and its pseudo-inverse J^+. Positions
     of unmeasured joints u satisfy them by steps q_u <- q_u - J_u^+ r(q); their velocities are
@@ -92,9 +92,10 @@ def close_loops(
 def _solve_constraints(
     model: Any, data: Any, positions: Sequence[int], velocities: Array
 ) -> Array | None:
-    """Move the unmeasured joints until the equality constraints are satisfied, by eq. (1).
+    """Move the unmeasured joints until the equality constraints are satisfied.
 
-    Each Gauss-Newton step is q_u <- q_u - J_u^+ r(q) (1).
+    Each Gauss-Newton step is q_u <- q_u - J_u^+ r(q) with the residual r of the constraints, their
+    Jacobian J, and its pseudo-inverse for the unmeasured joints u.
 
     Args:
         model: compiled model, whose constraints have a dense Jacobian.

@@ -99,7 +99,7 @@ class ModelFieldEffect:
 
 
 def add_to_file_value(file_value: Any, c: Any) -> Any:
-    """Add a coefficient to a value by eq. (1), at least zero; a negative file value may remain.
+    """Add a coefficient to a value; the sum is at least zero, or the value if it is negative.
 
     Args:
         file_value: value in the model file, number or array.
@@ -109,7 +109,7 @@ def add_to_file_value(file_value: Any, c: Any) -> Any:
 
 
 def compute_factor(c: Any) -> Any:
-    """Return the factor 1 + c of eq. (2), at least `MIN_FACTOR`."""
+    """Return the factor 1 + c of a scaled number, at least `MIN_FACTOR`."""
     return np.maximum(1.0 + c, MIN_FACTOR)
 
 
@@ -206,13 +206,15 @@ def _view_element(fields: Fields, element: ModelField) -> Any:
 
 
 def _add(find: Find) -> FieldWriter:
-    """Make a function that adds each coefficient c to its number in the model, at least zero (1).
+    """Make a function that adds each coefficient to its number in the model, at least zero.
 
     Args:
-        find: finds the element of each coefficient; only the main one of each is changed.
+        find: finds the model fields with the number of each coefficient, of which the first is
+            changed.
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+        """Add coefficients c (K, L) to the fields of L batch elements, in place."""
         for (element, *_), coefficient in zip(find(robot, place), c, strict=True):
             view = _view_element(fields, element)
             view[...] = add_to_file_value(view, coefficient)
@@ -221,15 +223,16 @@ def _add(find: Find) -> FieldWriter:
 
 
 def _scale(find: Find) -> FieldWriter:
-    """Make a function that scales a number of the model by 1 + c, in all elements that hold it (2).
+    """Make a function that scales a number of the model by 1 + c, in all fields that hold it.
 
     The factor is at least `MIN_FACTOR`, so that masses stay positive.
 
     Args:
-        find: finds the elements; the effect has one coefficient.
+        find: finds the model fields with the number; the effect has one coefficient.
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+        """Scale the fields of L batch elements in place by the coefficient c (1, L)."""
         (elements,) = find(robot, place)
         for element in elements:
             view = _view_element(fields, element)
@@ -240,9 +243,15 @@ def _scale(find: Find) -> FieldWriter:
 
 
 def _shift(find: Find) -> FieldWriter:
-    """Make a function that adds each coefficient to its number, without a lower limit."""
+    """Make a function that adds each coefficient to its number in the model, without a limit.
+
+    Args:
+        find: finds the model fields with the number of each coefficient, of which the first is
+            changed.
+    """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+        """Add coefficients c (K, L) to the fields of L batch elements, in place."""
         for (element, *_), coefficient in zip(find(robot, place), c, strict=True):
             _view_element(fields, element)[...] += coefficient
 
@@ -250,7 +259,7 @@ def _shift(find: Find) -> FieldWriter:
 
 
 def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the dry friction of a joint, at least zero (1).
+    """Add c to the dry friction of a joint; the sum is at least zero.
 
     Where the friction increases, it also becomes stiff, so that the joint hardly creeps at rest;
     if the robot's `friction_form` is ``soft``, the file's solver parameters remain.
@@ -270,7 +279,7 @@ def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
 
 def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale mass and inertia of a body by 1 + c, eq. (2), as if its density changed.
+    """Scale mass and inertia of a body by 1 + c, as if its density changed.
 
     Args:
         fields: fields of L batch elements, changed in place.
@@ -297,7 +306,7 @@ def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> N
 
 
 def _tilt_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
-    """Tilt gravity by adding g c_x along x and g c_y along y, eq. (4), with the magnitude g.
+    """Tilt gravity by adding g c_x along x and g c_y along y, with the magnitude g of gravity.
 
     Args:
         fields: fields of L batch elements, changed in place.
@@ -327,8 +336,8 @@ def _set_coupling(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     """Turn the axis of a joint by a rotation vector in the frame of its body, where it is not zero.
 
-    The axis a becomes exp([r]) a with the rotation vector r (6), by Rodrigues' formula. The result
-    is normalised, because MuJoCo expects a unit vector.
+    The axis a becomes exp([r]) a with the rotation vector r, by Rodrigues' formula. The result is
+    normalised, because MuJoCo expects a unit vector.
 
     Args:
         fields: model fields of L batch elements, changed in place.
@@ -374,7 +383,7 @@ def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array)
 def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     """Add a point mass to a body, in the batch elements whose payload is not zero.
 
-    A point mass m at p on a body of mass m_0, centre of mass p_0 and tensor I_0 gives (7)
+    A point mass m at p on a body of mass m_0, centre of mass p_0 and tensor I_0 gives
 
         mass     m_0 + m
         centre   p_1 = (m_0 p_0 + m p) / (m_0 + m)
@@ -409,7 +418,7 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
 
 
 def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Restrict the force range of an actuator to [-c, c], in batch elements with c > 0 (5).
+    """Restrict the force range of an actuator to [-c, c], in batch elements with c > 0.
 
     The result is the intersection with the range of the file. If this is empty, both ends are the
     end of the file's range that is nearer to [-c, c].
@@ -433,7 +442,7 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
 
 
 def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to both sliding friction coefficients of a pair of geoms, at least zero (1).
+    """Add c to both sliding friction coefficients of a pair of geoms; the sum is at least zero.
 
     Args:
         fields: fields of L batch elements, changed in place.
@@ -446,7 +455,7 @@ def _add_contact_friction(fields: Fields, robot: RobotModel, place: str, c: Arra
 
 
 def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Scale the radius of a geom by 1 + c, without changing mass and inertia of its body (8).
+    """Scale the radius of a geom by 1 + c, without changing mass and inertia of its body.
 
     The radius of a sphere, capsule or cylinder is scaled, or all half axes of an ellipsoid. If the
     geom grows, the volumes by which MuJoCo searches for contacts grow by the change of its largest
@@ -478,13 +487,14 @@ def _scale_solref(index: int) -> FieldWriter:
 
     MuJoCo's `solref` is (t, z), or in the direct form the negative stiffness and damping (-k, -b).
     There, k is proportional to 1 / (t z)^2 and b to 1 / t, so a change of t changes both, and a
-    change of z only k (9).
+    change of z only k.
 
     Args:
         index: 0 for the time constant, 1 for the damping ratio.
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+        """Scale the parameters of the pair of geoms `place`, by c (1, L) for L batch elements."""
         solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])
         direct = solref[:, 0] <= 0
         solref[~direct, index] *= factor[~direct]

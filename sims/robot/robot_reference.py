@@ -111,13 +111,13 @@ def make_robot_reference(kind: type[RobotSimulator]) -> RobotReference:
     robot = kind.robot
     differs = kind.numerics != read_integrator_settings(robot)
     return RobotReference(
-        Path(robot.path).resolve(),
-        robot.digest,
-        kind.free,
-        robot.actuator_tables,
-        robot.engine_table,
-        kind.numerics.to_document() if differs else {},
-        robot.friction_form,
+        path=Path(robot.path).resolve(),
+        digest=robot.digest,
+        free=kind.free,
+        actuators=robot.actuator_tables,
+        engine=robot.engine_table,
+        numerics=kind.numerics.to_document() if differs else {},
+        friction_form=robot.friction_form,
     )
 
 
@@ -164,6 +164,10 @@ def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotRefe
 
 def _check_numerics(source: Source, value: Any) -> dict[str, Any]:
     """Check the table ``[numerics]``: a time step in seconds, and options of MuJoCo's solver.
+
+    Args:
+        source: the file, for messages.
+        value: the table.
 
     Returns:
         The entries. Words such as an integrator's name stay words; numbers of iterations become

@@ -199,7 +199,8 @@ class RobotSimulator(SystemSimulator):
         column = 0
         for effect in self._freed:
             count = len(effect.coefficients)
-            acting.append((effect, theta[:, column : column + count].T[:, :, None]))
+            c = theta[:, column : column + count].T[:, :, None]  # (K, L, 1)
+            acting.append((effect, c))
             column += count
         acting += super()._make_active_effects(theta)
         placed_effects = [placed for effect, c in acting if c.any() for placed in effect.parts(c)]

@@ -166,7 +166,7 @@ def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | 
         inputs before the run are not known for at least one step.
     """
     known_inputs = [scenario.before[name] for name in scenario.inputs if name in scenario.before]
-    earlier_times = known_inputs[0][0] if known_inputs else np.empty(0)
+    earlier_times = next((times for times, _ in known_inputs), np.empty(0))
     steps = int(np.floor(-earlier_times[0] / step)) if earlier_times.size else 0
     # The inputs of one run must be known at equal times.
     have_equal_times = all(np.array_equal(times, earlier_times) for times, _ in known_inputs)

@@ -238,35 +238,35 @@ def settle_contacts(
     with capture_mujoco_warnings():
         # 1. Contacts that may be closed.
         model.begin_run(scenario, *start)
-        state, present = measured, model.evaluate(measured)
+        state, contacts = measured, model.evaluate(measured)
         keys = [
             key
-            for key, contact in present.items()
+            for key, contact in contacts.items()
             if contact.distance
             < MAX_DISTANCE_SIGMAS * float(np.linalg.norm(contact.normal * sigma[0]))
         ]
         if not keys:
             return start
-        cost = _compute_cost(present, keys)
+        cost = _compute_cost(contacts, keys)
         for _ in range(MAX_ITERATIONS):
             # The contacts are already in equilibrium.
             if cost <= SETTLED_COST * len(keys):
                 break
             # 2. Gauss-Newton step.
-            layout = tuple((key, present[key].is_closed) for key in keys)
-            residual = _compute_residual(present, present, keys)
+            layout = tuple((key, contacts[key].is_closed) for key in keys)
+            residual = _compute_residual(contacts, contacts, keys)
             # Without known derivatives, each iteration makes its own.
             reused = {} if known_jacobians is None else known_jacobians
             is_known = layout in reused
             if not is_known:
-                reused[layout] = _differentiate(model, state, present, residual, keys)
+                reused[layout] = _differentiate(model, state, contacts, residual, keys)
             jacobian = reused[layout]
             step = _solve(jacobian, residual, weights @ (state - measured), weights)
             # 3. Step length.
             for _ in range(MAX_HALVINGS):
-                contacts = model.evaluate(state + step)
+                new_contacts = model.evaluate(state + step)
                 offset = weights @ (state + step - measured)
-                new_cost = _compute_cost(contacts, keys) + float(offset @ offset)
+                new_cost = _compute_cost(new_contacts, keys) + float(offset @ offset)
                 if new_cost < cost:
                     break
                 step = step / 2.0
@@ -277,7 +277,7 @@ def settle_contacts(
                 del reused[layout]
                 continue
             has_converged = cost - new_cost < MIN_DECREASE * cost
-            state, present, cost = state + step, contacts, new_cost
+            state, contacts, cost = state + step, new_contacts, new_cost
             if has_converged:
                 break
     positions, velocities = np.split(state, 2)
@@ -287,7 +287,7 @@ def settle_contacts(
 def _differentiate(
     model: ContactModel,
     state: Array,
-    present: dict[_Key, _Contact],
+    contacts: dict[_Key, _Contact],
     residual: Array,
     keys: list[_Key],
 ) -> Array:
@@ -298,7 +298,7 @@ def _differentiate(
     Args:
         model: the robot.
         state: (2 D,) positions and velocities.
-        present: contacts at this state.
+        contacts: contacts at this state.
         residual: (m,) residual at this state.
         keys: contacts that may be closed, which make up the residual.
     """
@@ -306,7 +306,7 @@ def _differentiate(
     for i, difference in enumerate(np.repeat(DIFFERENCES, state.size // 2).tolist()):
         moved = state.copy()
         moved[i] += difference
-        changed = _compute_residual(model.evaluate(moved), present, keys)
+        changed = _compute_residual(model.evaluate(moved), contacts, keys)
         jacobian[:, i] = (changed - residual) / difference
     return jacobian
 
@@ -333,7 +333,7 @@ def _solve(jacobian: Array, residual: Array, offset: Array, weights: Array) -> A
 def _compute_residual(
     contacts: dict[_Key, _Contact], reference: dict[_Key, _Contact], keys: list[_Key]
 ) -> npt.NDArray[np.float64]:
-    """Return the residual (m,) of contact equilibrium (1), divided by its tolerances.
+    """Return the residual (m,) of contact equilibrium, divided by its tolerances.
 
     A closed contact must have no normal velocity and no acceleration of its point. An open one must
     have no normal velocity and the depth `FIRST_DEPTH`, so that it closes.
@@ -356,7 +356,15 @@ def _compute_residual(
 
 
 def _compute_cost(contacts: dict[_Key, _Contact], keys: list[_Key]) -> float:
-    """Return the sum of squares of the contacts; an open one costs at least its free fall."""
+    """Return the sum of squares of the residual of contact equilibrium.
+
+    Open contacts cost at least their free fall, so that closing them decreases the sum. If a
+    contact does not exist, the sum is infinite.
+
+    Args:
+        contacts: contacts at a state.
+        keys: contacts that may be closed, which make up the residual.
+    """
     if not all(key in contacts for key in keys):
         return float("inf")
     residual = _compute_residual(contacts, contacts, keys)

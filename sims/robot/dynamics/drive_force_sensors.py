@@ -35,14 +35,14 @@ class DriveSensorModel:
         robot: robot that is simulated.
         system: system of the robot.
         batch: MuJoCo batch, whose `drives` are the columns of the drive forces in its sensor data.
-        given: inputs of the batch elements.
+        inputs: inputs of the batch elements.
         step: step length in seconds.
     """
 
     robot: RobotModel
     system: RobotSystem
     batch: MujocoBatch
-    given: BatchInputs
+    inputs: BatchInputs
     step: float
 
     def shift_to_step_begin(self, readings: Array) -> None:
@@ -56,13 +56,14 @@ class DriveSensorModel:
         Args:
             readings: (n, S, k) sensor data of n batch elements in S steps; changed in place.
         """
-        given, mujoco_batch = self.given, self.batch
+        batch_inputs, mujoco_batch = self.inputs, self.batch
         batch_size = len(readings)
         for actuator in self.robot.actuators:
             control_change = (
-                given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
+                batch_inputs.instant[:, :, actuator.control]
+                - batch_inputs.controls[:, :, actuator.control]
             )
-            control_change = np.where(given.off[:, :, actuator.id], 0.0, control_change)
+            control_change = np.where(batch_inputs.off[:, :, actuator.id], 0.0, control_change)
             # Without a driven joint no sensor shows the force.
             if actuator.joint not in mujoco_batch.drives or not control_change.any():
                 continue
@@ -98,7 +99,7 @@ class DriveSensorModel:
         batch_indices = np.flatnonzero(find_active_elements(acting, len(x), is_in_drive))
         if not batch_indices.size:
             return
-        mujoco_batch, given, steps = self.batch, self.given, readings.shape[1]
+        mujoco_batch, batch_inputs, steps = self.batch, self.inputs, readings.shape[1]
         columns = [mujoco_batch.drives[name.removeprefix("q.")] for name in self.system.coordinates]
         drive_readings = readings[batch_indices][:, :, columns]
 
@@ -107,11 +108,11 @@ class DriveSensorModel:
             """Stack all steps of the selected batch elements into one axis."""
             return values[batch_indices, :steps].reshape(batch_indices.size * steps, -1)
 
-        inputs = {name: flatten(u) for name, u in given.applied_inputs.items()}
+        inputs = {name: flatten(u) for name, u in batch_inputs.applied_inputs.items()}
         for actuator in self.robot.actuators:
             # The output of an activation filter does not change within a step.
             if not self._is_filtered(actuator):
-                inputs[f"u.{actuator.name}"] = flatten(given.instant[:, :, actuator.control])
+                inputs[f"u.{actuator.name}"] = flatten(batch_inputs.instant[:, :, actuator.control])
         t = np.tile(self.step * np.arange(float(steps)), batch_indices.size)[:, None]
         drive = drive_readings.reshape(batch_indices.size * steps, -1)
         # The load on the other side of the transmissions does not matter to effects in drives.
@@ -119,11 +120,11 @@ class DriveSensorModel:
         stiffness = np.repeat(
             mujoco_batch.get_servo_stiffness(mujoco_batch.file_joints)[batch_indices], steps, axis=0
         )
-        if given.off.any():
+        if batch_inputs.off.any():
             is_servo_on = find_working_servos(
                 mujoco_batch.robot,
                 mujoco_batch.file_joints.velocities,
-                given.off[batch_indices, :steps],
+                batch_inputs.off[batch_indices, :steps],
             )
             stiffness = stiffness * is_servo_on.reshape(stiffness.shape)
         snapshot = make_snapshot(self.system, t, flatten(x), flatten(v), inputs, carried, stiffness)

@@ -148,14 +148,19 @@ class StepForces:
         groups = [slice(*ends) for ends in pairwise(function.input_ends)]
 
         def make_samples() -> Iterator[Array]:
-            """Yield values of all inputs, of which step, stiffness and coefficients are known."""
+            """Yield values (inputs, L) of all inputs of the function: random motions and states.
+
+            Times, step, stiffness and coefficients are not random.
+            """
             rng = np.random.default_rng(0)
             shape = function.input_ends[-1], len(self._stiffness)
             for number in range(TESTED_STATES):
                 sample = rng.normal(size=shape) * rng.choice(TEST_STATE_SIZES)
-                # Time at the beginning and in the middle, step length, and interval, in steps.
+                # The first groups are the time at the beginning and in the middle of a step, its
+                # length, and the interval over which hidden states advance: all in steps.
                 for group, steps in zip(groups, (number, number + 0.5, 1.0, 1.0), strict=False):
                     sample[group] = steps * self.step
+                # The last groups are stiffness, coefficients and hidden states.
                 *_, stiffness_group, coefficient_group, _ = groups
                 sample[stiffness_group] = self._stiffness.T
                 sample[coefficient_group] = effects.coefficients
@@ -255,7 +260,16 @@ def _make_function(
     joints, states = len(system.coordinates), 2 * len(effects.hidden)
 
     def bind(t: Any, middle: Any, step: Any, interval: Any, *values: Any) -> tuple[Evaluator]:
-        """Return the function that evaluates all effects; see `ArrayFunction.bind`."""
+        """Return the function that evaluates all effects on given registers.
+
+        Args:
+            t: time at the beginning of the step.
+            middle: time at its middle.
+            step: its length in seconds.
+            interval: time over which hidden states advance.
+            *values: motion (fields of `JointStates`), inputs, stiffness, coefficients, hidden
+                states.
+        """
         *motion, u, stiffness, coefficients, hidden_states = values
         at = JointStates(*motion)
         inputs = {name: u[:, i, None] for i, name in enumerate(input_names)}

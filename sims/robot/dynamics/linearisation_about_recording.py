@@ -287,8 +287,9 @@ class MeasuredLinear(RunLinearisation):
             similar: model of the same motion with the same Jacobians.
 
         Returns:
-            Changes of the defects d in (3), (T - 1, Z), and of the readings h(x̄) of the motion in
-            (4), (T, C), at T samples of C channels.
+            Changes (T - 1, Z) of the defects, the differences between the motion and the model's
+            own steps, in each interval between samples; and changes (T, C) of the readings of the
+            motion, at T samples of C channels.
         """
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             changes = self._tangent.compute_defect_changes(similar._tangent)
@@ -451,7 +452,7 @@ class MeasuredLinear(RunLinearisation):
         return self._compose(input_matrices, rows=self._tangent.point_of_step)
 
     def _compute_direct_readings(
-        self, read: Array, sensors: Sequence[ActiveEffects], predicted: Array
+        self, readings: Array, sensors: Sequence[ActiveEffects], predicted: Array
     ) -> Array:
         """Compute the direct changes ψ (T, C, K) of readings by K candidate effects.
 
@@ -464,17 +465,18 @@ class MeasuredLinear(RunLinearisation):
         * Candidates that change no reading are skipped.
 
         Args:
-            read: (S, O, K) direct changes of O readings by effects in the model, in each of S
+            readings: (S, O, K) direct changes of O readings by effects in the model, in each of S
                 steps.
             sensors: sensor effects of each of the K candidates.
             predicted: (T, Z) deviations of the predicted motion from the given one at T samples.
         """
         direct_changes = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
-        changing = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
+        changing = [k for k, acting in enumerate(sensors) if acting or readings[:, :, k].any()]
         if not changing:
             return direct_changes
         has_sensor_effect = np.array([bool(sensors[k]) for k in changing])
-        # The last row has no sensor effects; it is the reference for the others.
+        # Deviations of one motion for each of these candidates: the predicted motion if it has
+        # sensor effects. The last row has no sensor effects; it is the reference for the others.
         states = np.zeros((len(changing) + 1, self._motion.x.shape[0], self._tangent.state_size))
         if has_sensor_effect.any():
             forces = self._tangent.quotients.forces.shape[2]
@@ -483,7 +485,7 @@ class MeasuredLinear(RunLinearisation):
                 predicted, unforced
             )
         changes = np.concatenate(
-            [np.moveaxis(read[:, :, changing], 2, 0), np.zeros((1, *read.shape[:2]))]
+            [np.moveaxis(readings[:, :, changing], 2, 0), np.zeros((1, *readings.shape[:2]))]
         )
         observations = self._compute_observations(
             states, changes, [*(sensors[k] for k in changing), ()]
@@ -572,9 +574,9 @@ def compute_transmission_loads(
     """
     mujoco_batch = simulator.make_linearisation_batch(acting)
     outputs = [
-        (name, int(c))
+        (name, int(dof))
         for name in TRANSMISSION_FORCE_FIELDS
-        for c in mujoco_batch.all_joints.velocities
+        for dof in mujoco_batch.all_joints.velocities
     ]
     points = LinearisationPoints(
         mujoco_batch, simulator.robotic, motion, acting, outputs, mujoco_batch.all_joints

@@ -147,8 +147,8 @@ class RunLinearisation:
             inputs: inputs of a batch with one element.
 
         Returns:
-            Arguments of `RobotMotion` by name: controls, forces, applied inputs, and steps in which
-            drives are off.
+            Arguments of `RobotMotion` by name: mean controls over the steps, forces, controls at
+            the beginnings of steps, applied inputs, and whether actuators are off.
         """
         return {
             "controls": inputs.controls[0],

@@ -127,7 +127,7 @@ class MidpointPredictor:
         is_first_step, self._is_first_step = self._is_first_step, False
         a = np.zeros_like(a) if is_first_step else a
         if not self._needs_loads:
-            return JointStates(x, v, a, drive, bias, drive, bias)
+            return JointStates(x, v, a, drive, bias, later_drive=drive, later_bias=bias)
         loads, midpoint_loads = self._compute_transmission_loads(has_new_command, is_first_step)
         return JointStates(x, v, a, *loads, *midpoint_loads)
 

@@ -241,7 +241,8 @@ def write_series_element(
     file_armature = fields["dof_armature"][:, dof]
     drive = np.maximum(file_armature + element.drive * inertia, MIN_DRIVE_INERTIA_SHARE * inertia)
     fields["dof_armature"][:, dof] = drive
-    # Stiffness and damping of a spring, or of compliant flanks.
+    # Stiffness and damping of a spring, or of compliant flanks. Fields may have other options than
+    # the model.
     option = robot.compiled.opt
     step = float(fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep)
     integrator = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
@@ -300,8 +301,8 @@ def prepare_flanks_for_file(
     """Set the limits of added joints that represent the flanks of gaps, for writing a model file.
 
     A gap is a joint limit of ± half its width. Limits must be set before the model is compiled,
-    and those of compliant flanks depend on the compiled inertia (6). So with compliant flanks the
-    function is called again with the compiled model.
+    and those of compliant flanks (a gap with a spring) depend on the compiled inertia. So with
+    compliant flanks the function is called again with the compiled model.
 
     Args:
         robot: robot of `add_series_joints`.
@@ -381,8 +382,8 @@ def compute_rest_positions(
     They are the first states of links behind flexible or slack drives, which recordings do not
     contain. A load, such as gravity, deflects a spring by load / stiffness. In a gap it moves the
     links to the flank in its direction, or leaves them between the flanks if it is very small;
-    compliant flanks are deflected, too. Their stiffness is read back from the parameters of
-    MuJoCo's limit (6).
+    compliant flanks (a gap with a spring) are deflected, too. Their stiffness is read back from the
+    parameters of MuJoCo's joint limit: -`solref` times the inertia.
 
     Args:
         fields: model fields of the batch elements.

@@ -211,11 +211,11 @@ class TangentModel:
         """Compute the derivatives of a step by states, forces and controls at all points.
 
         1. List the displacements of states, forces and controls.
-        2. Compute forward differences (1) of the state after a step. For the Runge-Kutta method,
+        2. Compute forward differences of the state after a step. For the Runge-Kutta method,
            differentiate the accelerations instead. With contacts, which may begin or end within a
            difference, take the smaller ones of forward and backward differences by positions.
         3. For the Runge-Kutta method, compute the derivatives of the step from those of the
-           accelerations (3).
+           accelerations.
         """
         # 1. Displacements as quantity, index and size. The quantities are q position, v velocity,
         # a activation, w hidden state of an effect, p and r displacement and velocity of floating
@@ -309,9 +309,18 @@ class TangentModel:
     ) -> tuple[Array, Array]:
         """Return the result of `perturb_model_numbers` for a robot whose geoms touch.
 
-        A contact reacts to a force M da, so that the motion does not change by da. The force that
-        changes the velocity after a step by dv is inv(B) dv, with the derivatives B of this
-        velocity by forces, which include the reaction.
+        Without contacts, a change da of the acceleration by other model parameters is equivalent to
+        the force M da. But a contact reacts to this force, so that the motion would not change by
+        da. The force that changes the velocity after a step by dv is inv(B) dv, with the
+        derivatives B of this velocity by forces, which include the reaction.
+
+        Args:
+            acting: active effects including the one that changes the parameters.
+            change: size of the change, as a share of the effect's coefficients.
+            mujoco_batch: batch whose model has the required elements.
+
+        Returns:
+            Equivalent forces (N, E) and direct changes of readings (N, O), divided by `change`.
         """
         with self._at.with_batch(mujoco_batch):
             ends, readings = self._at.step_displaced({}, acting)

@@ -105,7 +105,8 @@ def _format_default_element(
         return "general", format_attributes(
             {**class_values, **{k: values[k] for k in ("gaintype", "biastype")}}
         )
-    gains = {"kp": format_number(values["gainprm"][0]), "kv": format_number(-values["biasprm"][2])}
+    (stiffness, *_), (_, _, negative_damping, *_) = values["gainprm"], values["biasprm"]
+    gains = {"kp": format_number(stiffness), "kv": format_number(-negative_damping)}
     return "position", gains | format_attributes(
         {k: v for k, v in class_values.items() if not k.startswith(("gain", "bias", "dyn"))}
     )
@@ -113,9 +114,9 @@ def _format_default_element(
 
 def _is_servo(values: Mapping[str, Values]) -> bool:
     """Return whether actuator attributes are those of MJCF's ``position`` shortcut."""
-    kinds = values["dyntype"][0], values["gaintype"][0], values["biastype"][0]
-    offset, stiffness = values["biasprm"][:2]
-    return kinds == (_NONE, _FIXED, _AFFINE) and offset == 0 and stiffness == -values["gainprm"][0]
+    kinds = values["dyntype"], values["gaintype"], values["biastype"]
+    (gain, *_), (offset, stiffness, *_) = values["gainprm"], values["biasprm"]
+    return kinds == ((_NONE,), (_FIXED,), (_AFFINE,)) and offset == 0 and stiffness == -gain
 
 
 def render_model_using_class(

@@ -194,7 +194,8 @@ def _list_totals(
     number_totals: list[Total | None] = []
     for c, before, total in zip(effect.coefficients, file_numbers, totals, strict=True):
         # Without a unit for this effect, the number has that of the coefficient.
-        unit = (slide_unit if is_at_slide else "") or hinge_unit or c.units[0]
+        effect_unit = slide_unit if is_at_slide and slide_unit else hinge_unit
+        unit = effect_unit or c.units[0] or "1"
         is_stated = np.isfinite([before, total]).all()
-        number_totals.append(Total(float(before), float(total), unit or "1") if is_stated else None)
+        number_totals.append(Total(float(before), float(total), unit) if is_stated else None)
     return number_totals

@@ -150,7 +150,7 @@ class UrdfWriter:
         return inertials
 
     def _write_mass(self, cause: FittedCause) -> None:
-        """Scale mass and inertia tensor of each link in the body by 1 + c, eq. (1)."""
+        """Scale mass and inertia tensor of each link in the body by 1 + c."""
         self._scale_inertials(cause, {"mass": ("value",), "inertia": _TENSOR_ATTRIBUTES})
 
     def _write_inertia_tensor(self, cause: FittedCause) -> None:

@@ -167,10 +167,10 @@ def _add_actuator(spec: Any, name: str, table: Mapping[str, Any]) -> None:
 
 
 def _set_pid(actuator: Any, gains: dict[str, float], kd: float | None) -> None:
-    """Make an actuator a PID servo, by eq. (4) or (5) of `add_actuators`.
+    """Make an actuator a PID servo, with or without a gain kd on the rate of the error.
 
-    With kd, a gain on the rate of the error, the actuator has two controls: the set point and
-    its rate. MuJoCo then takes kd in place of kv.
+    With kd, the actuator has two controls: the set point and its rate. MuJoCo then takes kd in
+    place of kv.
 
     Args:
         actuator: actuator of a `mujoco.MjSpec`, changed in place.

@@ -104,7 +104,8 @@ def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
         Text with the moments before and after; empty if nothing was changed.
     """
     moments, axes = inertia_tensors.compute_principal_moments(entries)
-    if moments[0] >= inertia_tensors.NEGLIGIBLE_MOMENT:
+    smallest, *_ = moments
+    if smallest >= inertia_tensors.NEGLIGIBLE_MOMENT:
         return ""
     after = inertia_tensors.find_nearest_valid_moments(moments)
     for key, entry in zip(
@@ -383,7 +384,12 @@ def _make_joint_names_unique(files: ModelFileReader, joints: Sequence[Element]) 
 
 
 def _get_link_name(files: ModelFileReader, joint: Element, tag: str) -> str:
-    """Return the name of the link at one end of a joint; `tag` is parent or child.
+    """Return the name of the link at one end of a joint.
+
+    Args:
+        files: reader of the files of the model, which makes the error.
+        joint: element of the joint.
+        tag: ``parent`` or ``child``.
 
     Raises:
         InputError: the joint does not state this link.

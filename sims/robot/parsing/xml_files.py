@@ -197,6 +197,10 @@ def resolve_includes(files: ModelFileReader, root: Element) -> None:
 def _expand_includes(files: ModelFileReader, parent: Element) -> list[Element]:
     """Return the children of an element, with include elements replaced by the included children.
 
+    Args:
+        files: reader of the model, which parses the included files.
+        parent: the element, which is not changed.
+
     Raises:
         InputError: an included file is not stated, absent, or included twice.
     """

@@ -236,10 +236,17 @@ def _make_channel_place(name: str, unit: str, joints: Sequence[EffectPlace]) -> 
     """
     quantity, _, joint_name = name.partition(".")
     joint = next((place for place in joints if place.name == joint_name), None)
-    if joint is None or quantity not in ("q", "qd", "tau"):
-        return EffectPlace(name, "hinge", None, name, unit, 1.0, 1.0, {}, f"channel {name}")
+    is_at_joint = joint is not None and quantity in ("q", "qd", "tau")
     return EffectPlace(
-        name, joint.kind, joint.coordinate, name, unit, joint.size, 1.0, {}, f"channel {name}"
+        name=name,
+        kind=joint.kind if joint and is_at_joint else "hinge",
+        coordinate=joint.coordinate if joint and is_at_joint else None,
+        signal=name,
+        unit=unit,
+        size=joint.size if joint and is_at_joint else 1.0,
+        inertia=1.0,
+        stated={},
+        words=f"channel {name}",
     )
 
 
@@ -275,15 +282,15 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
         )
     names = [get_geom_name(robot.compiled, geom) for geom in find_pair_geoms(robot, pair)]
     return EffectPlace(
-        pair,
-        "contact",
-        None,
-        "",
-        "1",
-        1.0,
-        1.0,
-        {"contact.friction": friction},
-        f"the contact of {names[0]} and {names[1]}",
+        name=pair,
+        kind="contact",
+        coordinate=None,
+        signal="",
+        unit="1",
+        size=1.0,
+        inertia=1.0,
+        stated={"contact.friction": friction},
+        words=f"the contact of {' and '.join(names)}",
         limits={"contact.softness": {"coefficient": (min_softness_change, np.inf)}},
         pairs=pairs,
     )
@@ -313,7 +320,11 @@ def has_radius(robot: RobotModel, geom: int) -> bool:
 
 
 def make_geom_place(robot: RobotModel, name: str) -> EffectPlace:
-    """Make the place of a geom with a radius.
+    """Make the place of a geom with a radius, such as a wheel, whose radius may be wrong.
+
+    Args:
+        robot: robot with the geom.
+        name: name of the geom.
 
     Raises:
         InputError: there is no such geom, or it has no radius.
@@ -322,8 +333,17 @@ def make_geom_place(robot: RobotModel, name: str) -> EffectPlace:
     if not has_radius(robot, geom):
         raise InputError(f"robot {robot.name}: geom {name} has no radius")
     radius = float(robot.compiled.geom_size[geom, 0])
-    stated = {"geom.radius": radius}
-    return EffectPlace(name, "geom", None, "", "1", 1.0, 1.0, stated, f"geom {name}")
+    return EffectPlace(
+        name=name,
+        kind="geom",
+        coordinate=None,
+        signal="",
+        unit="1",
+        size=1.0,
+        inertia=1.0,
+        stated={"geom.radius": radius},
+        words=f"geom {name}",
+    )
 
 
 def _make_actuator_place(
@@ -347,7 +367,17 @@ def _make_actuator_place(
     moved_joints = [place for place in joints if place.name in actuator.moves]
     size = max((place.size for place in moved_joints), default=STANDARD_GRAVITY * mass)
     inertia = max((place.inertia for place in moved_joints), default=mass)
-    return EffectPlace(actuator.name, actuator.motion, None, "", "", size, inertia, {}, "")
+    return EffectPlace(
+        name=actuator.name,
+        kind=actuator.motion,
+        coordinate=None,
+        signal="",
+        unit="",
+        size=size,
+        inertia=inertia,
+        stated={},
+        words="",
+    )
 
 
 def _get_servo_gains(robot: RobotModel, actuator: int) -> dict[str, float]:

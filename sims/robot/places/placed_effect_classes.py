@@ -248,7 +248,9 @@ def _has_quantity(effect_place: EffectPlace, c: Coefficient) -> bool:
         c: coefficient of the effect.
     """
     file_armature = effect_place.stated.get("inertia.armature", 0.0)
-    return c.of == "rotor" and file_armature > c.plausible[0][0] * effect_place.inertia
+    # An armature below the smallest plausible rotor does not count as stated.
+    (smallest_share, _), *_ = c.plausible
+    return c.of == "rotor" and file_armature > smallest_share * effect_place.inertia
 
 
 def _make_taking_method(
