@@ -202,13 +202,13 @@ def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
             geom.name = geom.name or f"{UNNAMED_PREFIX}geom{number}"
     for geoms in missing_pairs:
         parameters = combine_contact_parameters(model, geoms)
-        names = [
+        first_name, second_name = (
             model.geom(geom).name or UNNAMED_PREFIX + get_geom_name(model, geom) for geom in geoms
-        ]
+        )
         spec.add_pair(
             name=make_pair_name(model, geoms),
-            geomname1=names[0],
-            geomname2=names[1],
+            geomname1=first_name,
+            geomname2=second_name,
             **parameters._asdict(),
         )
     return replace(robot, spec=spec)

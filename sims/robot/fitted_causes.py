@@ -79,7 +79,9 @@ class FittedCause:
         return np.array([self.numbers.get(axis, zero).value for axis in axes])
 
     def format(self, recording: str) -> str:
-        """Format as ``friction.coulomb@elbow: 0.3 N·m (95 %: 0.28 to 0.32), fitted to log.csv``.
+        """Format the cause with its numbers, for a comment in a model file.
+
+        An example is ``friction.coulomb@elbow: 0.3 N·m (95 %: 0.28 to 0.32), fitted to log.csv``.
 
         An option of the solver whose values are words, such as the integrator, is formatted as
         ``numerics.integrator: from Euler to RK4``.
@@ -107,7 +109,7 @@ class FittedCause:
 
 
 def _format_estimate(number: FittedValue) -> str:
-    """Format as ``-0.05 N·m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N·m``.
+    """Format a fitted number as ``-0.05 N·m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N·m``.
 
     The parts are the fitted change, its confidence interval if it is known, and the number in the
     model file before and after the change if the file has one.

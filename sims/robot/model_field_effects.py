@@ -365,7 +365,7 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
 
 
 def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-    """Add c to the gravity compensation of a body (1 means weightless) where c is not zero.
+    """Add c to the gravity compensation of a body (1 means weightless); the sum is at least zero.
 
     Args:
         fields: fields of L batch elements, changed in place.
@@ -373,11 +373,8 @@ def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array)
         place: name of the body.
         c: (1, L) coefficient.
     """
-    column = fields["body_gravcomp"]
-    body_id = robot.body(place).id
-    column[:, body_id] = np.where(
-        c[0], add_to_file_value(column[:, body_id], c[0]), column[:, body_id]
-    )
+    compensation = fields["body_gravcomp"][:, robot.body(place).id]
+    compensation[:] = add_to_file_value(compensation, c[0])
 
 
 def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:

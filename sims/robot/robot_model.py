@@ -340,6 +340,7 @@ class RobotModel:
         model = self.compiled
         if int(model.actuator_trntype[i]) != int(mujoco.mjtTrn.mjTRN_TENDON):
             return ()
+        # A tendon is a list of objects: joints for a fixed tendon, others for a spatial one.
         tendon = int(model.actuator_trnid[i, 0])
         first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
         wrap_indices = range(first, first + count)

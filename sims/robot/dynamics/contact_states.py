@@ -182,7 +182,8 @@ class ContactModel:
             for jacobian, geom in zip(jacobians, (first, second), strict=True):
                 mujoco.mj_jac(model, data, jacobian, None, points[i], self._bodies[geom])
             rows = 3 if dims[i] > 1 else 1
-            relative = frames[i, :rows] @ (jacobians[1] - jacobians[0])
+            first_jacobian, second_jacobian = jacobians
+            relative = frames[i, :rows] @ (second_jacobian - first_jacobian)
             number = last_numbers[first, second] = last_numbers.get((first, second), -1) + 1
             # A contact without a force has no constraint, and so the address -1.
             contacts[first, second, number] = relative, distances[i], addresses[i] >= 0

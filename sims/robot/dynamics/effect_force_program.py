@@ -276,7 +276,10 @@ def _make_function(
         acting = effects.with_coefficients(coefficients)
 
         def evaluate() -> tuple[Any, Any, Any]:
-            """Return forces, limits of dry friction, and later hidden states."""
+            """Return forces and limits of dry friction at the middle of the step, and hidden states.
+
+            Arrays have a row for each batch element: (L, D), (L, D), and (L, 2 H) for H states.
+            """
             x, v = predict_midpoint(at.x, at.v, at.a, step)
             midpoint = make_snapshot(
                 system, middle, x, v, inputs, np.stack(at.at_midpoint), stiffness

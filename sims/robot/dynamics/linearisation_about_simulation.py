@@ -92,6 +92,7 @@ class RunLinearisation:
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             self._motion = self._simulate_nominal_motion()
             self._tangent = self._make_tangent_model()
+            # Batch elements that the preparation took, which are part of the cost.
             self._preparation_count = self._tangent.placed_element_count
         self._perturbation_cache: dict[tuple[str, bytes], tuple[Array, Array]] = {}
         self.observed = self._observe_nominal_motion()
@@ -208,8 +209,9 @@ class RunLinearisation:
 
     def _find_series_joint(self, second: str) -> int:
         """Return the number of the joint with which a joint is in series."""
-        coordinates = self._simulator.system.coordinates
-        return coordinates.index(f"q.{second.rpartition('_')[0]}")
+        # Its name is that of the joint and an ending.
+        joint, _, _ = second.rpartition("_")
+        return self._simulator.system.coordinates.index(f"q.{joint}")
 
     def compute_effect_responses(
         self, added: Sequence[EffectWithCoefficients]

@@ -111,7 +111,8 @@ def make_batch_spec(robot: RobotModel) -> Any:
     spec = robot.spec.copy()
     for body in spec.bodies:
         body.simple = False
-    # MuJoCo computes no gravity compensation if no body of the compiled model has any.
+    # MuJoCo computes no gravity compensation if no body of the compiled model has any. So one body
+    # gets a compensation that is too small to change a force.
     if not any(body.gravcomp for body in spec.bodies):
         spec.bodies[-1].gravcomp = GRAVCOMP_PLACEHOLDER
     return spec

@@ -220,7 +220,7 @@ class MjcfDocument:
         if compilers:
             compilers[-1].new |= absolute_folders
         else:
-            self.root.within.append(([], format_element("compiler", absolute_folders)))
+            self.root.insert_within(format_element("compiler", absolute_folders))
 
     def to_text(self) -> str:
         """Return the text with all changes; changed files replace their include elements."""

@@ -127,7 +127,7 @@ class MjcfWriter:
             return
         if not values:
             return
-        self.document.root.within.append((list(comments), format_element("option", values)))
+        self.document.root.insert_within(format_element("option", values), comments)
 
     def _keep_masses(self) -> None:
         """Change compiler settings so that MuJoCo uses inertials as specified."""
@@ -156,7 +156,7 @@ class MjcfWriter:
         if not inertials and not values:
             _add_comments(body, comments)
         elif not inertials:
-            body.within.append((list(comments), format_element("inertial", values)))
+            body.insert_within(format_element("inertial", values), comments)
         else:
             inertial = inertials[0]
             _add_comments(inertial, comments)
@@ -398,7 +398,8 @@ def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
     # 4. Joints in series, each after the joint of its drive.
     tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
     for series_joint in (joint for joint in robot.spec.joints if joint.name in robot.series):
-        joint_tag = tags.get(series_joint.name.rpartition("_")[0])
+        drive_joint, _, _ = series_joint.name.rpartition("_")
+        joint_tag = tags.get(drive_joint)
         if joint_tag is None:
             raise NotEditableError(f"no joint of its text is in series with {series_joint.name}")
         joint_tag.after.append(_render_series_joint(series_joint))
@@ -431,7 +432,7 @@ def _write_couplings(document: MjcfDocument, robot: RobotModel, model: Any) -> N
         c = format_number(float(model.wrap_prm[get_coupling_address(robot, name)]))
         joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
         tendon = f'<fixed name="{name}{COUPLING_TENDON_SUFFIX}">{joints}</fixed>'
-        document.root.within.append(([], f"<tendon>{tendon}</tendon>"))
+        document.root.insert_within(f"<tendon>{tendon}</tendon>")
         for actuator in (a for a in robot.actuators if a.joint == name):
             tags[actuator.id].removed |= {"joint", "jointinparent"}
             tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"
@@ -452,18 +453,18 @@ def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
     existing_pairs = document.find_pairs()
     names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "geom"}
     for pair in robot.spec.pairs:
-        geoms = [pair.geomname1, pair.geomname2]
-        if frozenset(geoms) in existing_pairs:
+        geoms = frozenset((pair.geomname1, pair.geomname2))
+        if geoms in existing_pairs:
             continue
-        if not set(geoms) <= names:
+        if not geoms <= names:
             raise NotEditableError(f"a geom of the contact {pair.name} has no name in its text")
-        attributes = {"name": pair.name, "geom1": geoms[0], "geom2": geoms[1]}
+        attributes = {"name": pair.name, "geom1": pair.geomname1, "geom2": pair.geomname2}
         attributes["condim"] = str(pair.condim)
         for name in ("friction", "solref", "solimp"):
             attributes[name] = format_numbers(tuple(getattr(pair, name)))
         attributes |= {name: format_number(getattr(pair, name)) for name in ("margin", "gap")}
         pair_text = format_element("pair", attributes)
-        document.root.within.append(([], f"<contact>{pair_text}</contact>"))
+        document.root.insert_within(f"<contact>{pair_text}</contact>")
 
 
 def _render_series_joint(second: Any) -> str:

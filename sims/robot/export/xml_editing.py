@@ -31,7 +31,7 @@ class XmlElement:
         removed: attributes to remove.
         renamed: new name of the element.
         before: comments to insert before it.
-        within: elements with comments to insert as its first children.
+        within: comments and the text of an element (may be empty) to insert as its first children.
         inserted: new children, whose attributes may still change; written after `within`.
         after: elements to insert after it.
         text: text that replaces the element.
@@ -66,6 +66,10 @@ class XmlElement:
         if name in self.new:
             return self.new[name]
         return None if name in self.removed else self.attributes.get(name)
+
+    def insert_within(self, element: str, comments: Iterable[str] = ()) -> None:
+        """Insert comments and the text of an element after those inserted as first children."""
+        self.within.append((list(comments), element))
 
     def walk(self) -> Iterator[XmlElement]:
         """Yield the element and all its descendants, in the order of the text."""

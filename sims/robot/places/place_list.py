@@ -381,14 +381,16 @@ def _make_actuator_place(
 
 
 def _get_servo_gains(robot: RobotModel, actuator: int) -> dict[str, float]:
-    """Return the servo gains of an actuator in the model file; zero if it is not a servo.
+    """Return the negative servo gains of an actuator in the model file; zero if it is not a servo.
+
+    MuJoCo's bias parameters hold them: the force on a servo per unit of its position and velocity.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         actuator: number of the actuator.
     """
-    bias = robot.compiled.actuator_biasprm[actuator]
-    return {"actuator.stiffness": float(bias[1]), "actuator.damping": float(bias[2])}
+    _, stiffness, damping, *_ = robot.compiled.actuator_biasprm[actuator].tolist()
+    return {"actuator.stiffness": stiffness, "actuator.damping": damping}
 
 
 def _get_body_file_values(robot: RobotModel, body: int) -> dict[str, float]:
