@@ -353,11 +353,11 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     rotation_vector[:, list(components)] = c[:, tilted_elements].T
     angle = np.linalg.norm(rotation_vector, axis=1, keepdims=True)
     unit_vector = rotation_vector / angle
-    along = np.sum(unit_vector * axis, axis=1, keepdims=True)
+    projection = np.sum(unit_vector * axis, axis=1, keepdims=True)
     rotated = (
         np.cos(angle) * axis
         + np.sin(angle) * np.cross(unit_vector, axis)
-        + (1.0 - np.cos(angle)) * along * unit_vector
+        + (1.0 - np.cos(angle)) * projection * unit_vector
     )  # (6)
     fields["jnt_axis"][tilted_elements, joint_id] = rotated / np.linalg.norm(
         rotated, axis=1, keepdims=True

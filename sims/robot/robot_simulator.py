@@ -58,9 +58,9 @@ from sims.robot.dynamics.run_batches import (
     BatchResult,
     BatchStart,
     RobotRunBatch,
-    group_batch_elements,
     group_by_run,
     list_last_read_times,
+    split_into_batches,
 )
 from sims.robot.dynamics.sensor_sampling import sample_readings
 from sims.robot.dynamics.stepping_with_forces import step_with_forces
@@ -267,34 +267,28 @@ class RobotSimulator(SystemSimulator):
         all_observations = np.full((len(x), max_samples, len(self.channels)), np.nan)
         # A diverging batch element becomes NaN, so floating-point warnings are suppressed.
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            for indices in group_batch_elements(acting, len(x)):
-                # Batch elements are sorted by run, so that data common to a run are computed once.
-                order = np.argsort(runs.scenario_index[indices], kind="stable")
-                sorted_indices = indices[order]
-                batch_count = max(-(-sorted_indices.size // BATCH_SIZE), 1)
-                for batch_indices in np.array_split(sorted_indices, batch_count):
-                    run_batches = [
-                        RobotRunBatch(
-                            runs.unique_scenarios[run],
-                            commands[run],
-                            slice_active_effects(acting, run_indices),
-                            x[run_indices],
-                            v[run_indices],
-                        )
-                        for run, run_indices in group_by_run(runs, batch_indices)
-                    ]
-                    try:
-                        run_observations = self._simulate_run_batch(
-                            run_batches, slice_active_effects(acting, batch_indices)
-                        )
-                    except RefusedModelError:
-                        # These elements stay NaN, like those of a diverging motion; the others are
-                        # simulated.
-                        continue
-                    for (_, run_indices), observations in zip(
-                        group_by_run(runs, batch_indices), run_observations, strict=True
-                    ):
-                        all_observations[run_indices, : observations.shape[1]] = observations
+            for batch_indices in split_into_batches(acting, runs, BATCH_SIZE):
+                groups = group_by_run(runs, batch_indices)
+                run_batches = [
+                    RobotRunBatch(
+                        runs.unique_scenarios[run],
+                        commands[run],
+                        slice_active_effects(acting, run_indices),
+                        x[run_indices],
+                        v[run_indices],
+                    )
+                    for run, run_indices in groups
+                ]
+                try:
+                    run_observations = self._simulate_run_batch(
+                        run_batches, slice_active_effects(acting, batch_indices)
+                    )
+                except RefusedModelError:
+                    # These elements stay NaN, like those of a diverging motion; the others are
+                    # simulated.
+                    continue
+                for (_, run_indices), observations in zip(groups, run_observations, strict=True):
+                    all_observations[run_indices, : observations.shape[1]] = observations
         # Negative zeros become positive, so that results do not depend on their origin.
         all_observations += 0.0
         return all_observations

@@ -348,6 +348,7 @@ def _compute_residual(
     rows: list[Array] = []
     for key in keys:
         contact = contacts.get(key, reference[key])
+        # The first component of the velocity is along the normal.
         rows.append(contact.velocity[:1] / SPEED_TOLERANCE)
         if reference[key].is_closed:
             rows.append(contact.acceleration / ACCELERATION_TOLERANCE)

@@ -276,9 +276,9 @@ def _make_function(
         acting = effects.with_coefficients(coefficients)
 
         def evaluate() -> tuple[Any, Any, Any]:
-            """Return forces and limits of dry friction at the middle of the step, and hidden states.
+            """Return forces and friction limits (L, D) at the middle of the step, and hidden states.
 
-            Arrays have a row for each batch element: (L, D), (L, D), and (L, 2 H) for H states.
+            The H hidden states (L, 2 H) are those after the interval.
             """
             x, v = predict_midpoint(at.x, at.v, at.a, step)
             midpoint = make_snapshot(

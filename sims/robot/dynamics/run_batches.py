@@ -189,6 +189,24 @@ class BatchResult(NamedTuple):
         return BatchResult(self.x[batch_indices], self.v[batch_indices], fields, *rest)
 
 
+def split_into_batches(
+    acting: ActiveEffects, runs: ScenarioGroups, max_size: int
+) -> Iterator[IndexArray]:
+    """Yield the indices of the elements of each batch, which are simulated together.
+
+    Elements are sorted by run, so that data common to a run are computed once for each batch.
+
+    Args:
+        acting: active effects, with coefficients (K, L, 1).
+        runs: runs (scenarios), and the number of the run of each of the L elements.
+        max_size: maximum number of elements of a batch.
+    """
+    for indices in group_batch_elements(acting, runs.scenario_index.size):
+        order = np.argsort(runs.scenario_index[indices], kind="stable")
+        batch_count = -(-indices.size // max_size)  # rounded up
+        yield from np.array_split(indices[order], batch_count)
+
+
 def group_batch_elements(acting: ActiveEffects, count: int) -> Iterator[IndexArray]:
     """Yield the indices of batch elements that can be simulated together.
 

@@ -129,7 +129,7 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
         coefficients = [
             _add_search_starts(_adapt_to_place(effect, c, effect_place))
             for c in declared_coefficients
-            if not _has_quantity(effect_place, c)
+            if not _is_rotor_inertia_stated(effect_place, c)
         ]
         # Simpler effects that it contains: those that are declared; and with a rotor, the armature
         # effect, which is a rigid transmission with the drive's inertia.
@@ -237,7 +237,7 @@ def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapsho
     return limit
 
 
-def _has_quantity(effect_place: EffectPlace, c: Coefficient) -> bool:
+def _is_rotor_inertia_stated(effect_place: EffectPlace, c: Coefficient) -> bool:
     """Return whether the model file states the inertia of the rotor that a coefficient stands for.
 
     The coefficient, the rotor's share of the joint inertia, is not needed then. Other coefficients
