@@ -276,7 +276,7 @@ def _make_function(
         acting = effects.with_coefficients(coefficients)
 
         def evaluate() -> tuple[Any, Any, Any]:
-            """Return forces and friction limits (L, D) at the middle of the step, and hidden states.
+            """Return forces and friction limits (L, D) at the middle of a step, and hidden states.
 
             The H hidden states (L, 2 H) are those after the interval.
             """
