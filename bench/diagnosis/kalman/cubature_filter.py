@@ -517,12 +517,15 @@ def _solve(matrices: Array, sides: Array) -> Array:
 
 
 def compute_root(matrices: Array) -> Array:
-    """Return square roots S of symmetric matrices (F, Z, Z), P = S S'."""
+    """Return square roots S of symmetric matrices P = S S', (F, Z, Z).
+
+    They are Cholesky factors or, if one of the matrices has none, those of the eigenvectors.
+    """
     try:
         root = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
     except np.linalg.LinAlgError:
-        # Rounding may make an eigenvalue negative, and a filter that diverges has matrices that are
-        # not finite; others of the batch must go on.
+        # Rounding may make an eigenvalue negative, which is set to zero. A filter that diverges has
+        # matrices that are not finite, and must not stop the others of the batch.
         values, vectors = np.linalg.eigh(np.nan_to_num(matrices))
         root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return root

@@ -120,7 +120,11 @@ class OutputErrorScores:
 
     @cached_property
     def regression(self) -> Regression:
-        """Regression (1) of the residual of the base model on the candidates of the library."""
+        """Regression (1) of the residual of the base model on the candidates of the library.
+
+        Responses to candidates that change the geometry of wheels or feet are simulated; the others
+        are linear. What first states explain is projected out of all of them.
+        """
         context, followed = self.context, self.context.filters.base
         library = context.columns.library
         # Responses (R, T, C, K) of K candidates.

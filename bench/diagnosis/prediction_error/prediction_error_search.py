@@ -183,7 +183,10 @@ class PredictionErrorSearch(EffectSearch):
         return self.correct_step_errors(model)
 
     def _make_identified_start(self) -> FitStart | None:
-        """Return a start with the effects that were identified with the base parameters, if any."""
+        """Return a start with the effects that were identified with the base parameters.
+
+        The result is None if base parameters were not identified, or without effects.
+        """
         identified, filters = self.evaluator.identified, self._search_context.filters
         if identified is None or not identified.effects:
             return None

@@ -257,7 +257,10 @@ class _ServoFitter:
 
     @cached_property
     def _places(self) -> list[tuple[str, str, str]]:
-        """Names of joint, actuator and position channel of each joint, at which effects may act."""
+        """Names of joint, actuator and position channel of each joint, at which effects may act.
+
+        For example ``elbow``, ``m_elbow`` and ``q.elbow``.
+        """
         evaluator = self._evaluator
         return [
             (
@@ -578,43 +581,57 @@ class _ServoFitter:
             The model in which those joints have these laws that are simulated better with them.
         """
         best_joint = int(np.argmin(model.costs / joint_model.costs))
-        # The joint model with the laws of the best joint, and the joints to which this adds laws.
-        theta, laws, joints = joint_model.theta.copy(), list(joint_model.laws), list[int]()
-        for joint, available in enumerate(self._laws_at_joint):
-            for name in model.laws[best_joint]:
-                law = name.partition("@")[0]
-                slot = self._evaluator.coefficient_slices.get(available.get(law, ""))
-                if slot is not None and available[law] not in laws[joint]:
-                    laws[joint] = (*laws[joint], available[law])
-                    theta[slot] = model.theta[self._evaluator.coefficient_slices[name]]
-            if joint != best_joint and set(laws[joint]) != set(model.laws[joint]):
-                joints.append(joint)
+        theta, laws = self._copy_laws(model, best_joint, joint_model)
+        joints = [
+            joint
+            for joint in self._joints
+            if joint != best_joint and set(laws[joint]) != set(model.laws[joint])
+        ]
         if not joints:
             return model
-        others = dict.fromkeys(set(self._joints) - set(joints), model)
         # The same servo needs the same correction of its stiffness and damping.
         corrected = theta.copy()
+        coefficient_indices = list[int]()
         for joint in joints:
-            best_joint_indices = self._list_parameters(best_joint, ())
-            corrected[self._list_parameters(joint, ())] = model.theta[best_joint_indices]
-        coefficient_indices = [
-            i
-            for joint in joints
-            for i in self._list_parameters(joint, laws[joint])
-            if i not in self._base_parameters[joint]
-        ]
+            corrected[self._base_parameters[joint]] = model.theta[self._base_parameters[best_joint]]
+            for name in laws[joint]:
+                coefficient_indices += self._evaluator.get_coefficient_indices(name)
         starts = []
         for start in (theta, corrected):
             for factor in SHARED_FACTORS:
                 scaled = start.copy()
                 scaled[coefficient_indices] *= factor
                 starts.append(self.simulate(scaled, laws))
+        # All other joints stay as they are in the fitted model.
+        others = dict.fromkeys(set(self._joints) - set(joints), model)
         nearest_starts = {joint: min(starts, key=lambda s: s.costs[joint]) for joint in joints}
         shared = self.fit(self._join(starts[0], nearest_starts | others), SHARED_ITERATIONS, joints)
         better = [joint for joint in joints if self._is_better(shared, model, joint)]
         if not better:
             return model
         return self.fit(self._join(model, dict.fromkeys(better, shared)), TRIAL_ITERATIONS)
+
+    def _copy_laws(
+        self, source: ServoModel, source_joint: int, target: ServoModel
+    ) -> tuple[Array, list[tuple[str, ...]]]:
+        """Return parameters (P,) and laws of a model with the laws of one joint at all joints.
+
+        A law that a joint has keeps its coefficients; one that it cannot have is left out.
+
+        Args:
+            source: the model from which the laws and their coefficients are taken.
+            source_joint: the joint from which they are taken.
+            target: the model to which they are added.
+        """
+        slices = self._evaluator.coefficient_slices
+        theta, laws = target.theta.copy(), list(target.laws)
+        for joint, available in enumerate(self._laws_at_joint):
+            for name in source.laws[source_joint]:
+                effect = available.get(name.partition("@")[0])
+                if effect is not None and effect not in laws[joint]:
+                    laws[joint] = (*laws[joint], effect)
+                    theta[slices[effect]] = source.theta[slices[name]]
+        return theta, laws
 
     def _is_better(self, model: ServoModel, other: ServoModel, joint: int) -> bool:
         """Return whether a model is better at a joint than another one.
@@ -635,6 +652,7 @@ class _ServoFitter:
 
         It must do so even without the run that gains most, so that one odd run does not decide.
         """
+        # Squared residual of each run.
         before, after = (
             np.square(self._compute_residual(one.simulated)[:, :, joint]).sum(axis=1)
             for one in (model, larger)
