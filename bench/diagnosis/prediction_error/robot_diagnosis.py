@@ -104,8 +104,7 @@ class Confirmation(Inquiry):
         self._model = search.fit_to_convergence(search.refit_first_states(self._model))
         lack_of_fit = assess_lack_of_fit(search, self._model)
         search_control.begin_question("alternatives")
-        # `_trial` is the validation on held-out runs, if there are any.
-        validation = self._trial
+        validation = self._held_out_validation
         model, causes = select_preferred_model(
             self.alternative_finder(search, validation, lack_of_fit.has_structure), self._model
         )
@@ -115,17 +114,18 @@ class Confirmation(Inquiry):
                 validation.evaluate_models([model])
         search_control.check_not_stopped()
         state = DiagnosisState(
-            causes=len(causes),
-            alternatives=any(cause.alternatives for cause in causes),
-            closed=compute_gap_closed(search, model, lack_of_fit),
-            unexplained=not search.leaves_only_creep_of_contacts(model)
+            cause_count=len(causes),
+            has_alternatives=any(cause.alternatives for cause in causes),
+            gap_closed=compute_gap_closed(search, model, lack_of_fit),
+            is_unexplained=not search.leaves_only_creep_of_contacts(model)
             and is_unexplained(
                 lack_of_fit.has_structure, search.compute_p_value_of_missing_effect(model)
             ),
-            missed=validation is not None and validation.has_unexplained_gap(model, lack_of_fit),
+            misses_held_out_gap=validation is not None
+            and validation.has_unexplained_gap(model, lack_of_fit),
         )
         verdict = decide_verdict(state)
-        if verdict == "unknown" and state.closed < MIN_REMOVED_SHARE:
+        if verdict == "unknown" and state.gap_closed < MIN_REMOVED_SHARE:
             # Effects that leave most of the discrepancy only mimic what is missing.
             model, causes = base, ()
         return self._make_result(verdict, base, model, causes, lack_of_fit)
@@ -145,7 +145,7 @@ class Confirmation(Inquiry):
         validation = None
         if self._held_out is not None:
             search_control.begin_question("held_out")
-            validation = self._trial = HeldOutValidation(self._held_out)
+            validation = self._held_out_validation = HeldOutValidation(self._held_out)
             validation.evaluate_models([search.base_model, model])
         search_control.begin_question("structure")
         if identified.is_residual_tested:
@@ -155,10 +155,11 @@ class Confirmation(Inquiry):
             lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)
         search_control.check_not_stopped()
         state = DiagnosisState(
-            causes=len(model.effects),
-            closed=compute_gap_closed(search, model, lack_of_fit),
-            unexplained=True,
-            missed=validation is not None and validation.has_unexplained_gap(model, lack_of_fit),
+            cause_count=len(model.effects),
+            gap_closed=compute_gap_closed(search, model, lack_of_fit),
+            is_unexplained=True,
+            misses_held_out_gap=validation is not None
+            and validation.has_unexplained_gap(model, lack_of_fit),
         )
         causes = sorted(
             (self._cause(name, gain) for name, gain in identified.gains.items()),
@@ -208,5 +209,5 @@ class Confirmation(Inquiry):
         validation = HeldOutValidation(self._held_out)
         validation.evaluate_models([search.base_model, model, *smaller_models, *competing_models])
         self._search_control.check_not_stopped()
-        self._trial = validation
+        self._held_out_validation = validation
         self._model = validation.drop_unhelpful_effects(search, model)

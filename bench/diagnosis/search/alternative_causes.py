@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,6 +63,7 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     """
     effect_count = len(model.effects)
     # 1. Replaced effects.
+    # A search on fewer samples may have compared this model with all replacements already.
     if search.settled_effects != frozenset(model.effects):
         model = _swap_each_effect(search, model)
     # 2. Neighbouring frequencies.
@@ -75,9 +77,9 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     competing_models = list_competing_models(search, model)
     if noise is None:
         competing_models = select_decisive(search, model, competing_models)
+    # The result is the best of the compared models. With structure in the residual, likelihoods
+    # only tell which model mimics it best, so no competing model replaces the model.
     compared_models = [model]
-    # With structure in the residual, merit only compares how well models mimic it, so no competing
-    # model replaces the model.
     if noise is not None:
         compared_models = [
             candidate
@@ -169,10 +171,11 @@ def list_competing_models(search: EffectSearch, model: FittedModel) -> list[Fitt
 def select_decisive(
     search: EffectSearch, model: FittedModel, competing_models: Sequence[FittedModel]
 ) -> list[FittedModel]:
-    """Return the competing models whose comparison with a model can change the answer.
+    """Return the competing models whose comparison with a model can change the diagnosis.
 
-    Far from the noise, no competing model replaces the model. They only show what may stand in
-    place of one of its effects, so those that differ in several effects are left out.
+    Near the noise these are all of them. Far from the noise, no competing model replaces the model;
+    they only show alternatives to one of its effects. So those that differ in several effects are
+    left out.
 
     Args:
         search: the search, with all fitted models.
@@ -186,10 +189,10 @@ def select_decisive(
 
 
 def _is_competitive(search: EffectSearch, other_model: FittedModel, model: FittedModel) -> bool:
-    """Return whether two models are close in merit or in excess residual.
+    """Return whether two models are close in penalised log-likelihood or in excess residual.
 
-    Merit is the penalised log-likelihood, and the excess residual the RMS residual in units of the
-    noise, minus one. Merit is misleading if the residual has structure.
+    The excess residual is the RMS residual in units of the noise, minus one. It is compared, too,
+    because likelihoods are misleading if the residual has structure.
 
     Args:
         search: the search, with all fitted models.
@@ -258,6 +261,18 @@ class CauseEvidence:
     preferred: str = ""
 
 
+class _CompetingEffect(NamedTuple):
+    """Effect that explains the data about as well as an effect of the model, in its place.
+
+    Attributes:
+        distance: how far its model is behind, in twice the log-likelihood.
+        name: name of the effect.
+    """
+
+    distance: float
+    name: str
+
+
 @dataclass(frozen=True)
 class AlternativeFinder:
     """Collects alternatives for the effects of a model.
@@ -289,12 +304,12 @@ class AlternativeFinder:
         reduced_model = self._get_model_without(model, effect)
         gain = model.likelihood.value - reduced_model.likelihood.value
         p_value = self._compute_p_value(reduced_model, effect, gain)
-        # Pairs of distance and name, the effect itself included.
-        competing_effects = self._list_competing_effects(model, effect)
-        # Effects with implausible coefficients come last in their set, the least plausible at the
-        # end.
-        competing_effects.sort(key=lambda pair: (self._compute_range_excess(pair[1]), pair))
-        ordered_effects = [name for _, name in competing_effects]
+        # The effect itself is included. Effects with implausible coefficients come last.
+        competing_effects = sorted(
+            self._list_competing_effects(model, effect),
+            key=lambda competitor: (self._compute_range_excess(competitor.name), competitor),
+        )
+        ordered_effects = [competitor.name for competitor in competing_effects]
         alternatives = tuple(name for name in ordered_effects if name != effect)
         # With structure in the residual, indistinguishable does not mean equally likely, so the
         # effect found is kept.
@@ -322,9 +337,14 @@ class AlternativeFinder:
     def _compute_p_value(self, reduced_model: FittedModel, effect: str, gain: float) -> float:
         """Return the p-value of an effect: how probable its gain is if the effect does not act.
 
-        The p-value of the gain of the fit and that of the linear score are computed; the smaller
-        one is returned, as either test may be more sensitive. Both compare with surrogate
-        residuals. Without simulation (`simulates` is false), only a stored p-value is used, or 1.
+        There are two tests, and the smaller p-value is returned, as either may be more sensitive:
+
+        * the gain of the fit with the effect;
+        * the linear score, which predicts gains without a fit.
+
+        Both compare with surrogate residuals: noise that contains no effect. Without scores about
+        the reduced model, those about another model are used (`reference_scores`), or new ones. If
+        the finder must not simulate (`simulates` is false), only a stored p-value is used, or 1.
 
         Args:
             reduced_model: model without the effect.
@@ -341,13 +361,13 @@ class AlternativeFinder:
             stored_scores or search.reference_scores or search.score_missing_effects(reduced_model)
         )
         null_quantiles = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
-        # A score is linear and the gain of a fit is not; either may be more sensitive.
+        # Gains are compared relative to what their effect gains from noise (90 % quantile).
         excess = gain - null_quantiles.get(effect, 0.0)
         by_refit = estimate_tail_p_value(scores.null_scores, np.array([excess]))
         by_score = search.best_p_values.get(key, 1.0)
         return min(by_score, by_refit)
 
-    def _list_competing_effects(self, model: FittedModel, effect: str) -> list[tuple[float, str]]:
+    def _list_competing_effects(self, model: FittedModel, effect: str) -> list[_CompetingEffect]:
         """List the effects that explain the data as well as the given one, with their distance.
 
         The report names them, because the data do not tell which of them acts. A competing effect
@@ -356,7 +376,7 @@ class AlternativeFinder:
         itself has the distance 0.
         """
         shared = set(model.effects) - {effect}
-        competing_effects = [(0.0, effect)]
+        competing_effects = [_CompetingEffect(0.0, effect)]
         for other_model in list(self.search.models.values()):
             names = set(other_model.effects)
             has_same_size = len(names) == len(model.effects)
@@ -373,49 +393,49 @@ class AlternativeFinder:
             if is_indistinguishable(distance) and not self._wastes_coefficients(
                 effect, added, distance
             ):
-                competing_effects.append((distance, added))
+                competing_effects.append(_CompetingEffect(distance, added))
         return self._remove_richer(competing_effects)
 
     def _wastes_coefficients(self, effect: str, other_effect: str, distance: float) -> bool:
         """Return whether another effect needs more coefficients but hardly fits better.
 
-        If the residual has structure, likelihoods do not account for the number of coefficients.
-        Each further coefficient must then reduce the excess residual (RMS residual in units of the
-        noise, minus one) as much as a richer law must. `distance` is how far the other model is
-        behind, in twice the log-likelihood.
+        This matters only if the residual has structure, because likelihoods then do not account for
+        the number of coefficients. Each further coefficient must reduce the excess residual (RMS
+        residual in units of the noise, minus one) as much as a richer law must: to 95 %.
 
         Args:
-            effect: Effect of the model.
-            other_effect: Effect that would replace it.
-            distance: Twice the difference of the log-likelihoods.
+            effect: effect of the model.
+            other_effect: effect that would replace it.
+            distance: how far the model with the other effect is behind, on the scale of twice the
+                log-likelihood; negative if it fits better.
         """
         if not self.structure:
             return False
-        slots = self.search.evaluator.coefficient_slices
         coefficient_count, other_count = (
-            int(slots[name].stop - slots[name].start) for name in (effect, other_effect)
+            len(self.search.evaluator.get_coefficient_indices(name))
+            for name in (effect, other_effect)
         )
         further_count = other_count - coefficient_count
+        # The logarithm of a ratio below one is negative, as the distance of a better model is.
         return further_count > 0 and distance > further_count * convert_excess_ratio(
             [MAX_RICHER_LAW_EXCESS_RATIO]
         )
 
-    def _remove_richer(self, competing_effects: list[tuple[float, str]]) -> list[tuple[float, str]]:
+    def _remove_richer(self, competing_effects: list[_CompetingEffect]) -> list[_CompetingEffect]:
         """Return the competing effects without those that contain another of them.
 
-        These are families of which one member explains as much, and richer laws of which the
-        simpler one does.
+        These are families (one effect at several places) of which one member explains as much, and
+        richer laws of which the simpler one does.
 
         Args:
-            competing_effects: Distance and name of each effect that explains the data about as
-                well.
+            competing_effects: effects that explain the data about as well.
         """
         effects = self.search.evaluator.available_effects
-        names = {name for _, name in competing_effects}
+        names = {competitor.name for competitor in competing_effects}
         return [
-            (distance, name)
-            for distance, name in competing_effects
-            if not names & set(effects[name].contains)
+            competitor
+            for competitor in competing_effects
+            if names.isdisjoint(effects[competitor.name].contains)
         ]
 
     def _act_in_one_loop(self, effect: str, other_effect: str) -> bool:
@@ -432,7 +452,9 @@ class AlternativeFinder:
     def _compute_distance(
         self, model: FittedModel, other_model: FittedModel, is_in_one_loop: bool
     ) -> float:
-        """Return how far another model is behind, in twice the log-likelihood.
+        """Return how far another model is behind, on the scale of twice the log-likelihood.
+
+        It is negative if the other model is better.
 
         1. If the residual has structure that neither model explains, likelihoods only compare how
            each model mimics it. Then the distance depends on the excess residuals of the models.
@@ -483,9 +505,10 @@ class AlternativeFinder:
     def _compute_comparable_likelihood(self, model: FittedModel) -> float:
         """Return the penalised log-likelihood by which competing models are compared.
 
-        For robots, the penalty for trying many effects is left out for effects with a single shape.
-        Two such effects differ, for example, only in a sign constraint: if all commands have the
-        same sign, a dead band is equivalent to a bias, and the penalty must not decide.
+        For robots, the penalty for what an effect gains from noise is left out, except for effects
+        with many shapes. It may differ for equivalent effects: if all commands have the same sign,
+        a dead band is equivalent to a bias, but its coefficient must be positive. The penalty must
+        not decide between them.
         """
         evaluator = self.search.evaluator
         if not evaluator.has_linearisation:
@@ -493,6 +516,7 @@ class AlternativeFinder:
         null_penalties = 0.0
         for name in model.effects:
             parameters = evaluator.parameters[evaluator.coefficient_slices[name]]
+            # Only a shape parameter, such as a frequency, has a positive lower bound.
             if not any(parameter.bounds[0] > 0 for parameter in parameters):
                 null_penalties += self.search.get_effect_penalty(name)
         return model.penalised_log_likelihood + null_penalties

@@ -98,7 +98,8 @@ def compute_directions(
 ) -> DirectionSet:
     """Compute how the simulated runs respond to each effect that a fitted model lacks.
 
-    The score test compares these responses with the residual of the model.
+    The score test compares these responses with the residual of the model. A probe is an effect
+    with the coefficients at which its response is computed.
 
     1. Compute the responses to scaling coefficients, and to limits of several sizes.
     2. Combine those that change the runs with modifiers: coefficients that act only together with
@@ -122,7 +123,8 @@ def compute_directions(
     # 3. Responses that change something.
     active_indices = np.flatnonzero(is_acting)
     probes = [probes[i] for i in active_indices] + modifier_probes
-    # This is the largest array of an explanation, so active rows are moved up within it.
+    # This is the largest array of an explanation, so it is not copied: the rows of active probes
+    # are moved up within it.
     for row, index in enumerate(active_indices.tolist()):
         if row < index:
             responses[row] = responses[index]
@@ -139,12 +141,15 @@ def iterate_first_probes(
 ) -> Iterator[CandidateDirection]:
     """Yield the coefficients at which the responses of an effect are computed.
 
+    A scaling coefficient is the strength of an effect, and zero switches the effect off. A shape
+    parameter, such as a frequency, cannot be zero.
+
     1. If the effect names its own points, these are used.
-    2. A scaling coefficient is the strength of an effect, and zero switches the effect off; each
-       gets a small value. A shape parameter, such as a frequency, cannot be zero; all its values on
-       a grid are combined with it.
+    2. Each scaling coefficient gets a small value, with each shape: each combination of the values
+       that are tried of the shape parameters.
     3. Effects that do not respond in proportion to their coefficients, such as end stops and
-       limits, get several full sizes instead.
+       limits, get several full sizes instead. Commands of a robot get delays of several sizes in
+       addition.
 
     Args:
         evaluator: evaluator that simulates the recorded runs.
@@ -152,16 +157,14 @@ def iterate_first_probes(
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     parameters = list_coefficients(evaluator, name)
-    # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
     effect = evaluator.available_effects[name]
     coefficients = effect.coefficients
     # 1. Points of the effect.
     for values in effect.probe_points():
         # Changes at several points add up to that at a point between them (`Effect.combine`).
         yield CandidateDirection(name, 0, 0, values, can_be_negative=True)
+    # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
     shape_indices = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
-    coefficient_count = len(parameters)
-    scaling_indices = [i for i in range(coefficient_count) if i not in shape_indices]
     travel = evaluator.get_effect_travel(name)
     grids = [
         parameters[i].bounds[:1]
@@ -169,43 +172,41 @@ def iterate_first_probes(
         else _make_shape_grid(evaluator, parameters[i], coefficients[i].tried, travel)
         for i in shape_indices
     ]
-    grid_point = 0
-    first_coefficient = coefficients[0]
-    # 2. Small values at each grid point of the shape.
-    # Scaling coefficients at one grid point act together, such as a sine and a cosine.
-    for point in product(*grids):
-        # A small limit of a force or a rate would remove all of it.
-        has_linear_response = (
-            first_coefficient.of not in NONLINEAR_COEFFICIENT_KINDS and not effect.probe_points()
-        )
-        for index in scaling_indices if has_linear_response else ():
-            low, high = parameters[index].bounds
-            values = np.zeros(coefficient_count)
-            values[shape_indices] = point
-            values[index] = INITIAL_PROBE_SHARE * high
-            yield CandidateDirection(
-                effect=name,
-                grid_point=grid_point,
-                coefficient_index=index,
-                coefficients=values,
-                can_be_negative=low < 0,
-            )
-        grid_point += 1
+    # All combinations of the shape parameters; a single empty one without shape parameters.
+    shapes = list(product(*grids))
+    # 2. Small values for each shape.
+    kind = coefficients[0].of
+    # A small limit of a force or a rate would remove all of it.
+    if kind not in NONLINEAR_COEFFICIENT_KINDS and not effect.probe_points():
+        for grid_point, shape in enumerate(shapes):
+            for index, parameter in enumerate(parameters):
+                if index in shape_indices:
+                    continue
+                low, high = parameter.bounds
+                values = np.zeros(len(parameters))
+                values[shape_indices] = shape
+                values[index] = INITIAL_PROBE_SHARE * high
+                # Those with the same grid point act together, such as a sine and a cosine.
+                yield CandidateDirection(
+                    effect=name,
+                    grid_point=grid_point,
+                    coefficient_index=index,
+                    coefficients=values,
+                    can_be_negative=low < 0,
+                )
     # 3. Full sizes.
-    if first_coefficient.of == "stop":
-        yield from _make_end_stop_candidates(evaluator, name, grid_point)
-        return
+    next_grid_point = len(shapes)
     lowest, highest = parameters[0].bounds
-    if first_coefficient.of == "shift" and evaluator.has_linearisation:
-        yield from _make_shift_probes(effect, highest, grid_point)
+    if kind == "stop":
+        yield from _make_end_stop_candidates(evaluator, name, next_grid_point)
+        return
+    if kind == "shift" and evaluator.has_linearisation:
+        yield from _make_shift_probes(effect, highest, next_grid_point)
     # A small limit does not act like a large one, so limits are tried at values that the input
     # reaches.
-    if first_coefficient.of in NONLINEAR_COEFFICIENT_KINDS or (
-        first_coefficient.of in ("input", "error") and lowest == 0
-    ):
-        shapes = np.array(list(product(*grids)))
+    if kind in NONLINEAR_COEFFICIENT_KINDS or (kind in ("input", "error") and lowest == 0):
         yield from _make_limit_probes(
-            evaluator, name, grid_point, shapes if shape_indices else None
+            evaluator, name, next_grid_point, np.array(shapes) if shape_indices else None
         )
 
 
@@ -214,14 +215,13 @@ def _make_shift_probes(
 ) -> Iterator[CandidateDirection]:
     """Yield delays and lags of commands of several sizes, in addition to a small one.
 
-    They are proposed alone, since a selection that begins with a lag in place of a wrong servo goes
-    astray. Sensors that read late have none. The states of a robot are the measured ones, so that
-    the true states are later readings. A regression on these is invalid, because the innovations of
-    a filter are independent of earlier readings only.
+    Each is proposed for a fit on its own, and not selected together with other effects: a selection
+    that begins with a lag in place of a wrong servo goes astray. Nothing is yielded for effects
+    that are not on an input, such as sensors that read late.
 
     Args:
         effect: the effect.
-        highest: largest plausible coefficient.
+        highest: largest plausible coefficient, in s.
         first_grid_point: number of the first candidate; the following ones count up from it.
     """
     if not isinstance(effect, Input):
@@ -430,9 +430,10 @@ def _find_observable_probes(
 
     Args:
         evaluator: run evaluator with the recorded runs.
-        probes: the K probes.
-        values: (K, R, T, C) direction of each probe; times the size of the probe it is the change.
+        probes: K effects, each with the coefficients at which its response was computed.
+        values: (K, R, T, C) change of the runs by each probe, divided by the size of the probe.
     """
+    # Rounding error (C,) of each channel.
     rounding = ROUNDING_SHARE * np.nanmax(np.abs(evaluator.observed), axis=(0, 1))
     # One changed channel is sufficient, because effects of a sensor show only in its channel.
     changes = [
@@ -444,17 +445,17 @@ def _find_observable_probes(
 
 
 def _compute_probe_sizes(probes: Sequence[CandidateDirection]) -> Array:
-    """Return the divisor c of eq. (1) for each probe (K,), which is its scaling coefficient.
+    """Return the size c (K,) of each probe, by which the change of the runs is divided.
 
-    It is one for a fixed probe, whose direction is the whole change.
-
-    The direction is d = (y(c) - y(0)) / c (1), with the runs y(c).
+    With the runs y(c) at the scaling coefficient c, the direction is d = (y(c) - y(0)) / c, eq. (1)
+    of the module docstring. If it is valid at one size only, it is the whole change, and c is one.
     """
-    sizes = []
-    for probe in probes:
-        size = 1.0 if probe.is_single_size else probe.coefficients[probe.coefficient_index]
-        sizes.append(size)
-    return np.array(sizes)
+    return np.array(
+        [
+            1.0 if probe.is_single_size else probe.coefficients[probe.coefficient_index]
+            for probe in probes
+        ]
+    )
 
 
 def _make_modifier_probes(
@@ -470,8 +471,9 @@ def _make_modifier_probes(
         probes: K single coefficients whose responses were computed.
         acting: (K,) mask of the coefficients that change the runs.
     """
+    # By name of the effect: its first acting coefficient, and its idle ones.
     acting_probes: dict[str, CandidateDirection] = {}
-    idle_probes: list[CandidateDirection] = []
+    idle_probes: dict[str, list[CandidateDirection]] = {}
     for probe, acts in zip(probes, acting, strict=True):
         if acts:
             acting_probes.setdefault(probe.effect, probe)
@@ -482,14 +484,11 @@ def _make_modifier_probes(
             and not probe.is_single_size
             and evaluator.available_effects[probe.effect].place != ALL_PLACES
         ):
-            idle_probes.append(probe)
-    modifiers: dict[str, list[CandidateDirection]] = {}
-    for probe in idle_probes:
+            idle_probes.setdefault(probe.effect, []).append(probe)
+    for name, modifiers in idle_probes.items():
         # An effect that does not act at all cannot be modified.
-        if probe.effect in acting_probes:
-            modifiers.setdefault(probe.effect, []).append(probe)
-    for name, members in modifiers.items():
-        yield from _iterate_grid_points(evaluator, acting_probes[name], members)
+        if name in acting_probes:
+            yield from _iterate_grid_points(evaluator, acting_probes[name], modifiers)
 
 
 def _iterate_grid_points(
@@ -524,10 +523,11 @@ def _iterate_grid_points(
 def _compute_directions(
     evaluator: RunEvaluator, fit: TrajectoryFit, probes: Sequence[CandidateDirection]
 ) -> Array:
-    """Compute the directions (K, R, T, C) of eq. (1): change of the runs per unit coefficient.
+    """Compute the directions (K, R, T, C): change of the runs per unit of a coefficient.
 
-    A direction is d = (y(c) - y(0)) / c, with the simulated runs y(c) at a small coefficient c. For
-    a candidate that is valid at one size only, it is the whole change y(c) - y(0).
+    A direction is d = (y(c) - y(0)) / c, with the simulated runs y(c) at a small coefficient c, eq.
+    (1) of the module docstring. For a candidate that is valid at one size only, it is the whole
+    change y(c) - y(0).
 
     Shapes: R runs, T samples, C channels.
 

@@ -143,16 +143,18 @@ def _search_states_of_base(search: EffectSearch) -> None:
     base = search.base_model
     if not search.compute_excess_residual(base) < MAX_EXCESS_OF_WRONG_STATES:
         return
-    states_before, deviations = search.evaluator.initial_state_guesses, search.evaluator.state_prior
-    assert deviations is not None
-    _search_first_states(search, search.evaluator, base.fit.theta)
-    states = search.evaluator.initial_state_guesses
+    evaluator = search.evaluator
+    states_before, deviations_before = evaluator.initial_state_guesses, evaluator.state_prior
+    assert deviations_before is not None
+    # It replaces the initial states of the evaluator if it finds better ones.
+    _search_first_states(search, evaluator, base.fit.theta)
+    states = evaluator.initial_state_guesses
     if states is states_before:
         return
     search.models.clear()
     model = search.fit_one(FitStart((), base.fit.theta, states))
     if not model.penalised_log_likelihood > base.penalised_log_likelihood:
-        search.evaluator.begin_at(states_before, deviations)
+        evaluator.begin_at(states_before, deviations_before)
         search.models[frozenset()] = base
 
 
@@ -177,6 +179,7 @@ def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
         value = _refine_coefficient(search, likeliest)
         fits.append(_fit_about_its_first_states(search, _make_start(search, value, states)))
     # 2. Other effects, from the initial states of the base model.
+    # The fit has replaced these states, and its cost is not comparable with fits about others.
     if not any(_is_explained(search, model) for model in fits):
         evaluator.begin_at(states, deviations)
         search.models.clear()
@@ -205,11 +208,12 @@ def _list_single_effect_starts(search: EffectSearch) -> list[FitStart]:
     3. Of a fitted family (one effect at all joints), each member is also tried alone.
 
     Args:
-        search: Search with its models. The fits of step 2 are added to `search.models`.
+        search: search with its models. The fits of step 2 are added to `search.models`.
     """
     base, evaluator = search.base_model, search.evaluator
     states = base.fit.initial_states
     # 1. Effects at contacts.
+    # Pairs of rank and start.
     ranked_starts = [
         (value.squares, _make_start(search, value, states))
         for value in _rank_effects_at_contacts(search, base)
@@ -224,21 +228,20 @@ def _list_single_effect_starts(search: EffectSearch) -> list[FitStart]:
             # 3. Members of a family.
             ranked_starts += _list_member_starts(search, model)
     limit = MAX_SCAN_RATIO * base.fit.cost
-    useful_starts = sorted(
-        (pair for pair in ranked_starts if pair[0] < limit), key=lambda pair: pair[0]
-    )
-    return [start for _, start in useful_starts[:MAX_TRIED_EFFECTS]]
+    ranked_starts.sort(key=lambda ranked_start: ranked_start[0])
+    return [start for rank, start in ranked_starts if rank < limit][:MAX_TRIED_EFFECTS]
 
 
 def _list_member_starts(search: EffectSearch, model: FittedModel) -> list[tuple[float, FitStart]]:
     """Return starts with single members of a fitted family, with their sums of squares.
 
     A family is one effect with a coefficient for each place, such as friction at all joints. Often
-    only one member acts, and a model with one coefficient is simpler.
+    only one member acts, and a model with one coefficient is simpler. The list is empty for effects
+    of another kind.
 
     Args:
-        search: Search with its run evaluator.
-        model: Fit of a family alone: one effect with a coefficient for each place.
+        search: search with its run evaluator.
+        model: fitted model with one effect.
     """
     (name,) = model.effects
     evaluator, fit = search.evaluator, model.fit
@@ -265,7 +268,8 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
     """Fit an effect and estimate the initial states in turn, while the sum of squares decreases.
 
     Contacts make the sum of squares rough, so Levenberg-Marquardt alone would stop at a wrong
-    place. Each round has these steps:
+    place. The rounds end when the effect explains the recording, or the cost hardly decreases. Each
+    round has these steps:
 
     1. Estimate the initial states by a smoother.
     2. Scan the coefficient of an effect at a contact.
@@ -273,8 +277,8 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
     4. Fit all of them by Levenberg-Marquardt.
 
     Args:
-        search: Search with its models and run evaluator.
-        start: Start with a single effect.
+        search: search with its models and run evaluator.
+        start: start with a single effect.
     """
     evaluator, sigma = search.evaluator, search.noise.sigma
     (name,) = start.effects
@@ -287,11 +291,17 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
     for _ in range(MAX_STATE_ESTIMATES):
         # 1. Smoother.
         smoothed = smooth_first_states(evaluator, theta, sigma)
+        # The filter diverges with this effect.
         if smoothed is None:
             return search.fit_one(start)
         # 2. Scan.
         if is_at_contact:
-            value = _ScannedValue(name, float(theta[indices[0]]), _get_unit(search, name), np.inf)
+            value = _ScannedValue(
+                name,
+                coefficient=float(theta[indices[0]]),
+                unit=_get_unit(search, name),
+                squares=np.inf,
+            )
             states = np.array([one.mean for one in smoothed])
             theta = _add_effect(search, _scan_in_turn(search, value, NEAR_SCAN_WIDTHS, states))
         # 3. Random search.
@@ -337,9 +347,9 @@ def _use_first_states_of(
     estimated with the final coefficients of the model.
 
     Args:
-        search: Search whose base model is fitted again.
-        evaluators: Run evaluators of the fitted and the held-out runs.
-        model: Model whose initial states are used.
+        search: search whose base model is fitted again.
+        evaluators: run evaluators of the fitted and the held-out runs.
+        model: model whose initial states are used.
     """
     base, evaluator = search.base_model, search.evaluator
     deviations = evaluator.state_prior
@@ -444,17 +454,17 @@ def _get_unit(search: EffectSearch, name: str) -> float:
 def _find_likeliest_effect(search: EffectSearch) -> _ScannedValue | None:
     """Return the effect at a contact, with a coefficient, that a Kalman filter finds likeliest.
 
-    Each effect at a contact is tried at several smaller and larger values of its coefficient. A
-    filter follows the data also where a simulation would diverge. Return None if there are no such
-    effects, or the filter fails for all.
+    Each effect at a contact is tried at several values of its coefficient that decrease or increase
+    the number of the model file (`unit`). A filter follows the data also where a simulation would
+    diverge. Return None if there are no such effects, or the filter fails for all.
 
     Args:
-        search: Search with its run evaluator.
+        search: search with its run evaluator.
     """
     values = []
-    for start in _list_effects_at_contacts(search):
-        values += [start._replace(coefficient=-share * start.unit) for share in DECREASES]
-        values += [start._replace(coefficient=share * start.unit) for share in INCREASES]
+    for effect in _list_effects_at_contacts(search):
+        values += [effect._replace(coefficient=-share * effect.unit) for share in DECREASES]
+        values += [effect._replace(coefficient=share * effect.unit) for share in INCREASES]
     if not values:
         return None
     likelihoods = _compute_log_likelihoods(search, values)
@@ -477,8 +487,8 @@ def _rank_effects_at_contacts(search: EffectSearch, base: FittedModel) -> list[_
     the base model. No derivative is used, since contacts make the motion rough.
 
     Args:
-        search: Search with its run evaluator.
-        base: Fitted base model.
+        search: search with its run evaluator.
+        base: fitted base model.
 
     Returns:
         The best value of each effect that explains a part of the discrepancy, the best effect
@@ -560,7 +570,7 @@ def _compute_log_likelihoods(search: EffectSearch, values: Sequence[_ScannedValu
     follows the data even if the model lacks an effect.
 
     Args:
-        search: Search with its run evaluator and noise.
+        search: search with its run evaluator and noise.
         values: N effects, each with one coefficient.
     """
     evaluator = search.evaluator
@@ -617,12 +627,13 @@ def search_in_contact(search: EffectSearch) -> FittedModel:
 
 
 def exclude_laws_with_many_shapes(search: EffectSearch) -> None:
-    """Exclude effects with many values of their shape parameters from the scores.
+    """Exclude effects with many values of their shape parameters from the scores of a search.
 
-    They are searched by separate fits, because scoring every shape would take too long.
+    Scoring every shape, such as every frequency, would take too long. `search_in_contact` includes
+    them again if the other effects do not explain the recording.
 
     Args:
-        search: Search whose `excluded_effects` are set.
+        search: search whose `excluded_effects` are set.
     """
     evaluator, base = search.evaluator, search.base_model.fit
     probe_counts = {
@@ -641,7 +652,7 @@ def _search_simple_laws(search: EffectSearch) -> FittedModel:
     single effects that might explain it as well are fitted (its competitors).
 
     Args:
-        search: Search with its models.
+        search: search with its models.
     """
     best = max(search.models.values(), key=lambda model: model.penalised_log_likelihood)
     if not search.is_noise_like(best) or not search.is_complete(best, MAX_P_VALUE_FURTHER_EFFECT):
@@ -668,9 +679,10 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
 
     Args:
         search: the search, with scores about the model.
-        model: fitted model: its effects, parameters, initial states and likelihood.
+        model: fitted model with one effect.
     """
     (name,) = model.effects
+    # Scores need derivatives at the parameters of the model itself.
     model = search.refine_jacobian(model)
     scan = search.cached_scans[frozenset(model.effects)]
     residual = search.compute_residual(model.fit)
@@ -694,13 +706,17 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     scores = test.compute_scores(residual + change)
     # 3. Selection.
     # Initial states absorb a part of the change.
-    before, after = (
+    (residual_without_effect,) = test.project_out((residual + change)[None])
+    squares_without, squares_with = (
         float(np.square(values / search.noise.sigma).sum())
-        for values in (test.project_out((residual + change)[None])[0], residual)
+        for values in (residual_without_effect, residual)
     )
     sample_count = int(search.observed_mask.sum())
-    # Without autocorrelation, a score is n log(SS / SS_k) of the sums of squares.
-    relative_residuals = np.sqrt(before * np.exp(-scores.white_noise_scores / sample_count) / after)
+    # For white noise and n samples, the score of effect k is n log(SS / SS_k), where SS is the sum
+    # of squares without any effect and SS_k that with effect k.
+    competing_squares = squares_without * np.exp(-scores.white_noise_scores / sample_count)
+    # RMS of the residual of each effect, relative to that of the present effect.
+    relative_residuals = np.sqrt(competing_squares / squares_with)
     order = [
         int(i)
         for i in np.argsort(relative_residuals)
@@ -718,15 +734,15 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
         white_noise_scores=scores.white_noise_scores[order],
     )
     # 4. Fits.
+    # They start from the model without its effect.
     theta = model.fit.theta.copy()
     theta[search.evaluator.coefficient_slices[name]] = 0.0
     base = search.base_model
     fit = replace(base.fit, theta=theta, initial_states=model.fit.initial_states)
-    base = replace(base, fit=fit)
     starts = select_refit_starts(
         search.evaluator,
         search.noise,
-        base,
+        replace(base, fit=fit),
         scan.directions,
         competitors,
         MAX_COMPETITORS,
@@ -745,21 +761,22 @@ def _find_columns(search: EffectSearch, model: FittedModel) -> list[int]:
 def _compute_change(search: EffectSearch, model: FittedModel) -> Array:
     """Return the change of the runs by the only effect of a model, to first order (R, T, C).
 
-    It is the derivative by all coefficients of the effect, scaled together, from central
-    differences. A contact can make the motion jump between two simulations; then a difference
-    quotient is arbitrarily large. So quotients with several step sizes are computed, and the
-    smallest is used.
+    With the runs y(c) at the coefficients c, it is the derivative of y((1 + h) c) by h, from
+    central differences. A contact can make the motion jump between two simulations; then a
+    difference quotient is arbitrarily large. So quotients with several h are computed, and that
+    with the smallest sum of squares is returned.
 
     Shapes: R runs, T samples, C channels.
 
     Args:
-        search: Search with its run evaluator.
-        model: Model with one effect.
+        search: search with its run evaluator.
+        model: model with one effect.
     """
     (name,) = model.effects
     evaluator, fit = search.evaluator, model.fit
     indices = list(evaluator.get_coefficient_indices(name))
     runs = len(fit.initial_states)
+    # Relative changes h of the coefficients, the positive ones first.
     shares = np.concatenate([DIFFERENCE_SHARES, -np.array(DIFFERENCE_SHARES)])
     samples = np.repeat(fit.theta[None], len(shares), axis=0)
     samples[:, indices] *= 1.0 + shares[:, None]
@@ -772,5 +789,6 @@ def _compute_change(search: EffectSearch, model: FittedModel) -> Array:
     widths = 2.0 * np.array(DIFFERENCE_SHARES)[:, None, None, None]
     changes = np.where(search.observed_mask, (upper - lower) / widths, 0.0)
     squares = np.square(changes / search.noise.sigma).sum(axis=(1, 2, 3))
-    result: Array = changes[int(np.argmin(np.nan_to_num(squares, nan=np.inf)))]
-    return result
+    # A simulation that diverges gives NaN.
+    smallest: Array = changes[int(np.argmin(np.nan_to_num(squares, nan=np.inf)))]
+    return smallest

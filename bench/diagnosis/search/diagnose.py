@@ -105,9 +105,9 @@ class Inquiry:
     def __init__(self, search: EffectSearch, held_out: Validation | None) -> None:
         """Start a diagnosis without results.
 
-        `_trial` is the validation of the models on held-out runs, and `_model` the best model so
-        far; both are None until their step is reached. They are kept so that a search that is
-        stopped early can report what it found.
+        `_held_out_validation` is the validation of the models on held-out runs, and `_model` the
+        best model so far; both are None until their step is reached. They are kept so that a search
+        that is stopped early can report what it found.
 
         Args:
             search: the search, which contains the fitted base model.
@@ -117,7 +117,7 @@ class Inquiry:
         self._search = search
         self._held_out = held_out
         self._search_control = search.evaluator.search_control
-        self._trial: HeldOutValidation | None = None
+        self._held_out_validation: HeldOutValidation | None = None
         self._model: FittedModel | None = None
 
     def answered(self) -> DiagnosisResult:
@@ -157,9 +157,11 @@ class Inquiry:
         # 6. Alternatives.
         self._search_control.begin_question("alternatives")
         model, causes = select_preferred_model(
-            AlternativeFinder(search, self._trial, lack_of_fit.has_structure), self._model
+            AlternativeFinder(search, self._held_out_validation, lack_of_fit.has_structure),
+            self._model,
         )
-        validation = self._trial
+        validation = self._held_out_validation
+        # Steps 4 to 6 may have changed the effects since the fit to convergence.
         if model.effects != validated_effects:
             model = search.fit_to_convergence(model)
             if validation is not None:
@@ -167,11 +169,12 @@ class Inquiry:
         # 7. Verdict.
         self._search_control.check_not_stopped()
         state = DiagnosisState(
-            causes=len(causes),
-            alternatives=any(cause.alternatives for cause in causes),
-            closed=compute_gap_closed(search, model, lack_of_fit),
-            unexplained=_is_unexplained(search, model, lack_of_fit),
-            missed=validation is not None and validation.has_unexplained_gap(model, lack_of_fit),
+            cause_count=len(causes),
+            has_alternatives=any(cause.alternatives for cause in causes),
+            gap_closed=compute_gap_closed(search, model, lack_of_fit),
+            is_unexplained=_is_unexplained(search, model, lack_of_fit),
+            misses_held_out_gap=validation is not None
+            and validation.has_unexplained_gap(model, lack_of_fit),
         )
         # Report the base model that was fitted first, even if the search found a better fit of it.
         return self._make_result(decide_verdict(state), base, model, causes, lack_of_fit)
@@ -198,7 +201,7 @@ class Inquiry:
         if unidentified:
             lack_of_fit = assess_lack_of_fit(search, base)
             return DiagnosisResult(
-                verdict=decide_verdict(DiagnosisState(fixed=False)),
+                verdict=decide_verdict(DiagnosisState(is_base_determined=False)),
                 model=base,
                 base=base,
                 causes=(),
@@ -219,7 +222,7 @@ class Inquiry:
         validation = _validate_on_held_out(self._search, self._model, self._held_out)
         # Unfinished fits of initial states would be held against their model.
         self._search_control.check_not_stopped()
-        self._trial = validation
+        self._held_out_validation = validation
         # The effects that remain after dropping an idle one may have simpler forms.
         self._model = self._search.simplify_laws(
             validation.drop_unhelpful_effects(self._search, self._model)
@@ -233,7 +236,7 @@ class Inquiry:
         Returns:
             Whether the model was replaced.
         """
-        model, validation, search = self._model, self._trial, self._search
+        model, validation, search = self._model, self._held_out_validation, self._search
         if (
             model is None
             or validation is None
@@ -257,16 +260,17 @@ class Inquiry:
         search = self._search
         early_stop = self._search_control.make_early_stop(self._held_out is not None)
         model = self._model or search.get_best_so_far()
-        if self._trial is None and self._held_out is not None and model.effects:
+        if self._held_out_validation is None and self._held_out is not None and model.effects:
             validation = HeldOutValidation(self._held_out)
             with suppress(SearchStoppedError), self._search_control.use_reserve():
                 validation.evaluate_models([search.base_model, model])
                 self._search_control.check_not_stopped()
-                self._trial = validation
-        # The residual was not tested, so it is counted as structure and not as noise.
+                self._held_out_validation = validation
+        # The residual was not tested, so the verdict counts it as structure and not as noise. The
+        # report shows only its size.
         lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)
         alternatives = self.alternative_finder(
-            search, self._trial, structure=False, simulates=False
+            search, self._held_out_validation, structure=False, simulates=False
         )
         causes = alternatives.collect_evidence(model)
         share = compute_gap_closed(search, model, lack_of_fit)
@@ -293,7 +297,11 @@ class Inquiry:
             causes: evidence for the causes, strongest first.
             lack_of_fit: lack-of-fit result of the extended model.
         """
-        held_out_fits = self._trial.held_out_fits if self._trial is not None else None
+        held_out_fits = (
+            self._held_out_validation.held_out_fits
+            if self._held_out_validation is not None
+            else None
+        )
         return DiagnosisResult(
             verdict, model, base, causes, lack_of_fit, held_out_fits=held_out_fits
         )
@@ -304,11 +312,11 @@ def is_motionless(search: EffectSearch) -> bool:
 
     Without motion the residual is only rounding, so the diagnosis ends before the search.
     """
+    # Range of each channel (C,) over all runs and samples (R, T, C).
     observed = search.evaluator.observed
-    largest = np.nanmax(observed, axis=(0, 1))
-    smallest = np.nanmin(observed, axis=(0, 1))
-    ranges = largest - smallest
-    # Parameters that do not influence the simulated runs were fixed by the base fit.
+    ranges = np.nanmax(observed, axis=(0, 1)) - np.nanmin(observed, axis=(0, 1))
+    # The base fit has fixed the parameters that do not influence the simulated runs. If these are
+    # all base parameters, the model expects no motion either.
     is_model_sensitive = len(search.fixed_parameters) != search.evaluator.base_indices.size
     residual_sigma = search.base_model.likelihood.sigma
     return verdict_rules.is_motionless(
@@ -319,16 +327,21 @@ def is_motionless(search: EffectSearch) -> bool:
 def _build_motionless_result(search: EffectSearch) -> DiagnosisResult:
     """Return the verdict "unidentifiable" for a recording without motion.
 
-    Args:
-        search: Search with the base model.
+    No base parameter can be determined, and no test of the residual is meaningful.
     """
     base, evaluator = search.base_model, search.evaluator
-    # No parameter can be determined, and no test of the residual is meaningful.
-    unidentified = tuple(evaluator.parameters[i].name for i in evaluator.base_indices)
-    excess = base.likelihood.sigma / search.noise.sigma
-    no_lack_of_fit = LackOfFitResult(1.0, "", excess, ())
     return DiagnosisResult(
-        decide_verdict(DiagnosisState(fixed=False)), base, base, (), no_lack_of_fit, unidentified
+        verdict=decide_verdict(DiagnosisState(is_base_determined=False)),
+        model=base,
+        base=base,
+        causes=(),
+        lack_of_fit=LackOfFitResult(
+            p_value=1.0,
+            where="",
+            excess=base.likelihood.sigma / search.noise.sigma,
+            channels_above_noise=(),
+        ),
+        unidentified_parameters=tuple(evaluator.parameters[i].name for i in evaluator.base_indices),
     )
 
 
@@ -343,14 +356,15 @@ def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tup
         base: base model: the simulator without additional effects, fitted to the runs.
     """
     variances = np.diagonal(compute_covariance(search, base))
-    spread = np.sqrt(np.maximum(variances, 0.0))
-    parameters = [search.evaluator.parameters[place] for place in base.fit.free_indices]
-    unidentified = []
-    for parameter, deviation in zip(parameters, spread.tolist(), strict=True):
+    # Rounding may make a variance slightly negative.
+    deviations = np.sqrt(np.maximum(variances, 0.0))
+    relative_deviations = {}
+    for index, deviation in zip(base.fit.free_indices, deviations.tolist(), strict=True):
+        parameter = search.evaluator.parameters[index]
         low, high = parameter.bounds
         if not verdict_rules.is_identified(deviation, low, high):
-            unidentified.append((deviation / (high - low), parameter.name))
-    return tuple(name for _, name in sorted(unidentified, key=lambda entry: -entry[0]))
+            relative_deviations[parameter.name] = deviation / (high - low)
+    return tuple(sorted(relative_deviations, key=lambda name: -relative_deviations[name]))
 
 
 def _validate_on_held_out(
@@ -367,8 +381,8 @@ def _validate_on_held_out(
         held_out: predicts held-out runs.
     """
     models = search.models.values()
-    # Parts of the model are included, because an effect that does not help on held-out runs is
-    # dropped.
+    # Models with a subset of the effects are included, because effects that do not help on held-out
+    # runs are dropped.
     names = set(model.effects)
     submodels = [m for m in models if set(m.effects) < names]
     singles = [m for m in models if len(m.effects) == 1]
@@ -386,8 +400,9 @@ def _validate_on_held_out(
 def _is_unexplained(search: EffectSearch, model: FittedModel, lack_of_fit: LackOfFitResult) -> bool:
     """Return whether the model lacks something: structure in the residual, or a significant effect.
 
-    The p-value of the best missing effect (`p_value`) comes from an earlier score test, or from one
-    that is made here if the residual is above the noise.
+    A score test predicts the gain of each missing effect, to first order and without a fit. The
+    p-value of the best one comes from an earlier test, or from one that is made here if the
+    residual is above the noise.
 
     Args:
         search: the search, with all fitted models.
@@ -408,19 +423,20 @@ def compute_gap_closed(
     """Return the share of the discrepancy on the fitted runs that a model removes.
 
     With the RMS residuals b of the base model and a of this model, in units of the noise, it is (b
-    - max(a, 1)) / (b - 1), or 0 if the base model leaves no discrepancy. The noise of a channel
-    whose residual has no structure is that residual.
+    - max(a, 1)) / (b - 1), or 0 if the base model leaves no discrepancy. If the residual of the
+    model has no structure, it is noise, and replaces the noise floor where it is larger.
 
     Args:
         search: search for causes, with its run evaluator, noise and fitted models.
         model: the extended model.
         lack_of_fit: lack-of-fit test of the model: p-value and description.
     """
+    noise = search.noise.sigma
     residual_sigma = model.likelihood.sigma
-    # A residual without structure is noise, even if it exceeds an estimated noise floor.
-    is_residual_noise = np.isfinite(residual_sigma) & ~lack_of_fit.has_structure
-    floor = np.where(is_residual_noise, residual_sigma, search.noise.sigma)
-    noise = np.maximum(floor, search.noise.sigma)
+    # A residual without structure is noise, even if it exceeds an estimated noise floor. A channel
+    # without samples has no residual.
+    if not lack_of_fit.has_structure:
+        noise = np.where(np.isfinite(residual_sigma), np.maximum(residual_sigma, noise), noise)
     before = _compute_normalised_rms(search, search.base_model, noise)
     after = _compute_normalised_rms(search, model, noise)
     # At the noise floor there is no discrepancy, and the quotient would be rounding error.

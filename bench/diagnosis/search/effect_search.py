@@ -1,4 +1,4 @@
-"""Beam search for the set of effects that explains a recording.
+"""Beam search for the set of effects that explains a recording: add, drop, simplify, swap effects.
 
 Linear scores select candidates, full fits decide, and moves between models correct errors. Forward
 selection alone is not enough: if two effects act, the first choice is often a third effect that
@@ -85,6 +85,10 @@ class EffectSearch(ScoredModelSet):
             corrected.
         thorough: whether the search continues while the models with the lowest excess improve, even
             if the model that it extends does not.
+
+    `_reduced_effect_sets` has the models (as sets of effects) whose effects were removed one by one
+    already, and `_fitted_simplifications` the pairs of a model and its simplification that were
+    fitted already.
     """
 
     best_supported_model: FittedModel | None = None
@@ -105,9 +109,11 @@ class EffectSearch(ScoredModelSet):
         3. Accept the best of them if its gain is significant.
         4. Otherwise continue only far from the noise: if two effects explain the data only
            together, neither has much merit alone.
+        5. Stop if the larger model is still far from the data.
         """
         best = self.base_model
         for effect_count in range(1, MAX_EFFECTS + 1):
+            # Stored for a search that has to end early.
             self.best_supported_model = best
             # 1. Completeness.
             # A further effect requires stronger evidence than the first one.
@@ -119,6 +125,7 @@ class EffectSearch(ScoredModelSet):
             larger = self._search_size(best, effect_count)
             if larger is None:
                 break
+            # 3. Significant gain.
             if (
                 larger.penalised_log_likelihood > best.penalised_log_likelihood
                 and self.compute_missing_effect_p_value(best, larger) <= EFFECT_P_VALUE_THRESHOLD
@@ -129,6 +136,7 @@ class EffectSearch(ScoredModelSet):
             # noise.
             elif self.compute_excess_residual(best) < FAR_EXCESS or self.is_noise_like(best):
                 break
+            # 5. No progress.
             # The missing effect is then not in the library, and three effects would only mimic it.
             if effect_count > 1 and is_hopeless(self, larger):
                 break
@@ -167,7 +175,8 @@ class EffectSearch(ScoredModelSet):
         ]
         self.refit_models([m.fit.make_start() for m in close_models], is_racing=False)
         best = select_by_size(self, effect_count)[0]
-        # A fit is replaced only by a likelier one.
+        # A refit replaces a model only if it is likelier. If the best model is one from before, no
+        # corrected model is likelier.
         if models_before.get(frozenset(best.effects)) is best:
             self.evaluator.discretisation_correction = correction_before
         return best
@@ -214,13 +223,9 @@ class EffectSearch(ScoredModelSet):
         if size == 1:
             return self.simplify_laws(self._choose_simpler_effect(larger))
         # An idle effect is dropped before the exchange, which would replace it by another idle one.
-        return self.simplify_laws(
-            select_conservative_model(
-                self,
-                best,
-                self.drop_unneeded_effects(self.swap_effect(self.drop_unneeded_effects(larger))),
-            )
-        )
+        larger = self.swap_effect(self.drop_unneeded_effects(larger))
+        larger = self.drop_unneeded_effects(larger)
+        return self.simplify_laws(select_conservative_model(self, best, larger))
 
     def _grow_models(self, size: int) -> FittedModel | None:
         """Return the best model with `size` effects; None if none could be fitted.
@@ -249,7 +254,8 @@ class EffectSearch(ScoredModelSet):
     def _is_explained_with(self, size: int) -> bool:
         """Return whether the best model with `size` effects leaves nothing to explain.
 
-        A residual above the noise answers this without a score test.
+        Its residual must be noise, and no effect that it lacks may have a significant score. Scores
+        cost many simulations, and are computed only if the residual is noise.
         """
         model = self.get_best(size)
         if model is None:
@@ -360,9 +366,13 @@ class EffectSearch(ScoredModelSet):
         return self.models[remaining_effects]
 
     def _fit_without(self, model: FittedModel, names: Iterable[str]) -> None:
-        """Fit and store the models that lack one of the effects `names`.
+        """For each name, fit and store the model without this effect.
 
         Each fit starts from the present parameters and initial states of the model.
+
+        Args:
+            model: fitted model with all effects.
+            names: names of effects of the model, which are removed one at a time.
         """
         starts = []
         for name in names:
@@ -383,11 +393,11 @@ class EffectSearch(ScoredModelSet):
         """Return the model without effects that it does not need.
 
         An effect is not needed if the model without it has at least the same penalised
-        log-likelihood. Each smaller model is fitted from the larger one, even if it is known.
-        Effects are dropped one at a time.
+        log-likelihood. Effects are dropped one at a time.
         """
         key = frozenset(model.effects)
-        # From here, the smaller model may reach a minimum that was missed when it was built up.
+        # Smaller models are fitted again from this one, even if they are known: they may reach a
+        # minimum that was missed when they were built up. This is done once for each model.
         if len(model.effects) > 1 and key not in self._reduced_effect_sets:
             self._reduced_effect_sets.add(key)
             self._fit_without(model, model.effects)
@@ -400,13 +410,15 @@ class EffectSearch(ScoredModelSet):
     def simplify_laws(self, model: FittedModel) -> FittedModel:
         """Return the model with richer laws and families replaced by simpler ones.
 
-        A law is replaced by one or all of the simpler laws that it contains, and a family by its
-        most active member, if the simpler model has at least the same merit or nearly the same
-        excess.
+        A law is replaced by one or all of the simpler laws that it contains, and a family (one
+        effect at several joints or bodies) by its most active member. The simpler model must have
+        at least the same penalised log-likelihood, or nearly the same excess residual (RMS residual
+        in units of the noise, minus one). It is then simplified further.
         """
         for name in model.effects:
             for parts in self._iterate_simpler_effects(model, name):
                 simpler_model = self._fit_with_parts(model, name, parts)
+                # Without an excess, both models leave only noise, and the ratio means nothing.
                 is_excess_close = (
                     self.compute_excess_residual(model)
                     > MAX_RICHER_LAW_EXCESS_RATIO * self.compute_excess_residual(simpler_model)
@@ -430,10 +442,10 @@ class EffectSearch(ScoredModelSet):
             name: name of the effect to replace.
         """
         contained_laws = self._split_into_contained_laws(model, name)
-        yield from ({law: c} for law, c in contained_laws.items())
-        # If the shape parameter of a law lies outside the range of the data, the law acts as the
-        # sum of its parts. One law with a time far longer than the runs replaces two simpler laws,
-        # and fits the data immediately.
+        for law, coefficients in contained_laws.items():
+            yield {law: coefficients}
+        # If the shape parameter of a law is far from the range of the data, such as a time longer
+        # than the runs, the law acts as the sum of the laws that it contains.
         if len(contained_laws) > 1:
             yield contained_laws
         yield from self._find_dominant_member(model, name)
@@ -452,11 +464,14 @@ class EffectSearch(ScoredModelSet):
         effects = self.evaluator.available_effects
         coefficient_slices = self.evaluator.coefficient_slices
         coefficients = model.fit.theta[coefficient_slices[name]]
-        laws, begin = EffectStarts(), 0
+        laws: EffectStarts = {}
+        begin = 0
         for law in effects[name].contains:
+            # A contained effect at another place is a member of a family, and not a simpler law.
             if law in effects and effects[law].place == effects[name].place:
-                end = begin + coefficient_slices[law].stop - coefficient_slices[law].start
-                laws[law], begin = coefficients[begin:end], end
+                end = begin + len(self.evaluator.get_coefficient_indices(law))
+                laws[law] = coefficients[begin:end]
+                begin = end
         return laws
 
     def _find_dominant_member(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
@@ -465,16 +480,18 @@ class EffectSearch(ScoredModelSet):
         The members are one effect at several joints or bodies. Nothing is yielded for other
         effects, or if the members share their coefficients.
 
+        Shapes: M members with k coefficients each.
+
         Args:
             model: fitted model: its effects, parameters, initial states and likelihood.
             name: name of the family.
         """
         members = getattr(self.evaluator.available_effects[name], "members", ())
         indices = self.evaluator.get_coefficient_indices(name)
-        per_member = len(members[0].coefficients) if members else 0
-        if len(members) < 2 or len(indices) != per_member * len(members):
+        count_per_member = len(members[0].coefficients) if members else 0
+        if len(members) < 2 or len(indices) != count_per_member * len(members):
             return
-        coefficients = model.fit.theta[indices].reshape(len(members), per_member)
+        coefficients = model.fit.theta[indices].reshape(len(members), count_per_member)  # (M, k)
         free_indices = model.fit.free_indices.tolist()
         columns = [free_indices.index(index) for index in indices]
         # Change of all samples per unit of each coefficient (root of the sum of squares).
@@ -494,6 +511,7 @@ class EffectSearch(ScoredModelSet):
             name: the richer effect.
             parts: the simpler effects, with coefficients to start from.
         """
+        # The parts take the place of the effect. One that the model has already is listed once.
         effects_of_each = ([*parts] if n == name else [n] for n in model.effects)
         names = tuple(dict.fromkeys(chain.from_iterable(effects_of_each)))
         key = frozenset(names)
@@ -508,6 +526,7 @@ class EffectSearch(ScoredModelSet):
             theta = model.fit.theta.copy()
             theta[self.evaluator.coefficient_slices[name]] = 0.0
             for part, coefficients in parts.items():
+                # A part that the model has already gets the sum of both coefficients.
                 theta[self.evaluator.coefficient_slices[part]] += coefficients
             return self.fit_one(FitStart(names, theta, model.fit.initial_states))
         return self.models[key]
@@ -543,9 +562,9 @@ def select_by_size(models: ModelSet, size: int) -> list[FittedModel]:
 def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
     """Return the models with `size` effects to extend: the likeliest and the nearest to the data.
 
-    The likelihood is the penalised one. Far from the data it is misleading, because AR(1) noise
-    explains almost any residual there; the sum of squares, by which the nearest are selected, is
-    not.
+    The likeliest have the highest penalised log-likelihood. Far from the data it is misleading,
+    because AR(1) noise explains almost any residual there. So those with the lowest sum of squares,
+    the nearest, are added.
 
     Args:
         search: the search, with all fitted models.

@@ -83,15 +83,15 @@ def select_refit_starts(
     """Return starts of fits with one more effect, for the effects with the best scores.
 
     1. Rank the effects by their scores.
-    2. Make starts with several values of the coefficients for each peak of an effect's score: a
-       peak is the best shape, such as a frequency, or another local maximum.
+    2. Make starts with several values of the coefficients for each score peak of an effect: its
+       best shape, such as a frequency, or another local maximum of the score.
     3. Simulate all starts, and keep the nearest to the data for each peak.
 
     Args:
         evaluator: evaluator that simulates the recorded runs.
         noise: noise of each channel.
         model: fitted model to extend by one effect.
-        direction_set: sensitivity directions of the candidates.
+        direction_set: directions, which are the responses of the runs to the candidate effects.
         scores: scores of the candidates about this model.
         max_count: maximum number of candidates.
         fits_all: whether to include all candidates, or for robots up to `MAX_REFITS_THOROUGH`.
@@ -103,27 +103,27 @@ def select_refit_starts(
     )
     if fits_all and evaluator.has_linearisation:
         max_count, min_relative_score = MAX_REFITS_THOROUGH, 0.0
-    # If scores are less reliable, they only order the fits, and exclude no candidate.
-    is_all_wanted = fits_all and not evaluator.has_linearisation
     # 1. Ranked effects.
-    for i in _rank_candidates(
+    ranked_candidates = _rank_candidates(
         scores,
         max_count,
         min_relative_score,
-        is_all_wanted,
-        _find_simulated_scores(evaluator, scores),
-    ):
+        # If scores are less reliable, they only order the fits, and exclude no candidate.
+        includes_all=fits_all and not evaluator.has_linearisation,
+        simulated_candidates=_find_simulated_scores(evaluator, scores),
+    )
+    for i in ranked_candidates:
         name = scores.effects[i]
         # 2. Starting values.
         # The score peaks of an effect are fitted separately, because each may lead to its own
         # minimum.
         for peak_number, (group, predicted_coefficients) in enumerate(scores.peaks[i]):
             known_jacobian = _predict_jacobian(evaluator, model, direction_set, group, name)
-            for c in _list_start_sizes(
+            for coefficients in _list_start_coefficients(
                 evaluator, direction_set, group, predicted_coefficients, name
             ):
                 start = replace(
-                    add_effect_to_start(evaluator, model.fit.make_start(), name, c),
+                    add_effect_to_start(evaluator, model.fit.make_start(), name, coefficients),
                     known_jacobian=known_jacobian,
                 )
                 numbered_starts.append((peak_number, start))
@@ -158,14 +158,18 @@ def _find_simulated_scores(evaluator: RunEvaluator, scores: CandidateScores) -> 
 def _rank_candidates(
     scores: CandidateScores,
     max_count: int,
-    share: float,
-    is_all_wanted: bool,
-    simulated: frozenset[int],
+    min_relative_score: float,
+    includes_all: bool,
+    simulated_candidates: frozenset[int],
 ) -> list[int]:
     """Return the indices of the effects to refit, the most promising first.
 
-    1. Effects with the best scores above their null-hypothesis level.
-    2. Effects with the best scores for white noise, if they are not among these.
+    Scores are compared after their null level is subtracted: what noise alone reaches (90 %
+    quantile). Selected are:
+
+    1. Effects with the best scores.
+    2. Effects that reduce the sum of squares most, which are those with the best scores for white
+       noise.
     3. Effects scored by full simulation that exceed all linear scores. They are added to the others
        and replace none: far from the data, their score may exceed the first-order score of the true
        effect.
@@ -173,54 +177,59 @@ def _rank_candidates(
     Args:
         scores: scores of all candidates.
         max_count: maximum number of candidates by their score.
-        share: minimum score above the null level, as a fraction of the best one.
-        is_all_wanted: whether to return all candidates.
-        simulated: candidates scored by full simulation, which are selected separately.
+        min_relative_score: minimum score above the null level, as a fraction of the best one.
+        includes_all: whether to return all candidates, ordered by their scores.
+        simulated_candidates: candidates scored by full simulation, which are selected separately.
     """
     score_excess = scores.score - scores.null_quantiles
     ranked: list[int] = np.argsort(-score_excess, kind="stable").tolist()
-    if is_all_wanted:
+    if includes_all:
         return ranked
     # 1. Best scores.
-    order = [i for i in ranked if i not in simulated]
-    selected = [i for i in order if score_excess[i] >= share * score_excess[order[0]]][:max_count]
-    # 2. White noise.
-    by_squares = [
-        int(i) for i in np.argsort(-scores.white_noise_scores, kind="stable") if i not in simulated
+    linear = [i for i in ranked if i not in simulated_candidates]
+    best_excess = score_excess[linear[0]] if linear else -np.inf
+    selected = [i for i in linear if score_excess[i] >= min_relative_score * best_excess][
+        :max_count
     ]
-    selected_by_squares = by_squares[:MAX_REFITS_BY_SQUARES]
+    # 2. Sum of squares.
+    by_squares = [
+        int(i)
+        for i in np.argsort(-scores.white_noise_scores, kind="stable")
+        if i not in simulated_candidates
+    ]
+    selected += [i for i in by_squares[:MAX_REFITS_BY_SQUARES] if i not in selected]
     # 3. Full simulations.
-    best_excess = score_excess[order[0]] if order else -np.inf
-    selected_by_simulation = [
-        i for i in ranked if i in simulated and score_excess[i] >= best_excess
-    ][:MAX_REFITS_BY_SIMULATION]
-    selected += [i for i in selected_by_squares if i not in selected]
-    return selected + selected_by_simulation
+    by_simulation = [
+        i for i in ranked if i in simulated_candidates and score_excess[i] >= best_excess
+    ]
+    return selected + by_simulation[:MAX_REFITS_BY_SIMULATION]
 
 
-def add_effect_to_start(evaluator: RunEvaluator, start: FitStart, name: str, c: Array) -> FitStart:
-    """Add an effect to a model, in place of the effects that it contains.
+def add_effect_to_start(
+    evaluator: RunEvaluator, start: FitStart, name: str, coefficients: Array
+) -> FitStart:
+    """Add an effect to the start of a fit, in place of the simpler effects that it contains.
 
-    The start of the new effect takes over the coefficients of those: an effect and one that it
-    contains together would have no unique solution.
+    Both together would have no unique solution: Stribeck friction, for example, contains Coulomb
+    friction. What the simpler effects did is added to the coefficients of the new one.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        start: the model.
+        start: start of a fit of the model without the effect.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-        c: (k,) coefficients of the effect.
+        coefficients: (k,) coefficients of the effect.
 
     Returns:
         Start of a fit, with the effect last.
     """
     effect = evaluator.available_effects[name]
-    contained, theta = effect.contains, start.theta.copy()
-    for contained_effect in sorted(set(contained) & set(start.effects)):
-        part_slice = evaluator.coefficient_slices[contained_effect]
-        c = effect.taking(c, contained_effect, theta[part_slice])
-        theta[part_slice] = 0.0
-    theta[evaluator.coefficient_slices[name]] = c
-    remaining_effects = [n for n in start.effects if n not in contained]
+    theta = start.theta.copy()
+    for simpler_effect in sorted(set(effect.contains) & set(start.effects)):
+        simpler_slice = evaluator.coefficient_slices[simpler_effect]
+        coefficients = effect.taking(coefficients, simpler_effect, theta[simpler_slice])
+        theta[simpler_slice] = 0.0
+    theta[evaluator.coefficient_slices[name]] = coefficients
+    remaining_effects = [n for n in start.effects if n not in effect.contains]
     return FitStart((*remaining_effects, name), theta, start.initial_states)
 
 
@@ -231,45 +240,45 @@ def _predict_jacobian(
     group: DirectionGroup,
     name: str,
 ) -> KnownJacobian | None:
-    """Return the approximate Jacobian of a model with one more effect, from known derivatives.
+    """Return the approximate Jacobian of a robot's model with one more effect, without simulations.
 
-    A fit that starts with it needs no simulations for its first Jacobian. It consists of the
-    Jacobian of the model and the directions of the effect. Columns of simpler effects that the new
-    one contains are dropped, since it replaces them. Return None if the directions do not contain
-    all coefficients: none for shape coefficients, such as frequencies, whose range does not contain
-    zero.
+    A fit can start with it. It consists of the Jacobian of the model, without the columns of
+    simpler effects that the new one replaces, and the directions of the effect (changes of the runs
+    per unit of a coefficient).
 
     Args:
         evaluator: evaluator that simulates the recorded runs.
         model: fitted model without the effect.
         direction_set: directions of all candidates about this model.
-        group: directions of the effect at one grid point.
+        group: the columns of `direction_set` that belong to the effect at one choice of its shape.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+
+    Returns:
+        The Jacobian; None if it cannot be composed: for systems that are not robots, if the
+        directions are no derivatives but changes by one full size, and for effects with a shape
+        coefficient, such as a frequency, which has no direction.
     """
     if not evaluator.has_linearisation:
         return None
-    columns = {
-        direction_set.candidates[i].coefficient_index: i
-        for i in group.column_indices
-        if not direction_set.candidates[i].is_single_size
+    column_by_coefficient = {
+        direction_set.candidates[column].coefficient_index: column
+        for column in group.column_indices
+        if not direction_set.candidates[column].is_single_size
     }
     coefficient_indices = evaluator.get_coefficient_indices(name)
-    shape_indices = [
-        i
-        for i in range(len(coefficient_indices))
-        if evaluator.parameters[coefficient_indices[i]].bounds[0] > 0
-    ]
-    if not columns or shape_indices:
+    # Only the range of a shape coefficient does not contain zero.
+    has_shape = any(evaluator.parameters[index].bounds[0] > 0 for index in coefficient_indices)
+    if not column_by_coefficient or has_shape:
         return None
     jacobian = np.zeros((*direction_set.responses.shape[:3], len(coefficient_indices)))
-    for index, column in columns.items():
-        jacobian[..., index] = direction_set.responses[..., column]
-    contained = [
-        evaluator.get_coefficient_indices(n)
-        for n in evaluator.available_effects[name].contains
-        if n in model.effects
-    ]
-    replaced_indices = {index for span in contained for index in span}
+    for coefficient_index, column in column_by_coefficient.items():
+        jacobian[..., coefficient_index] = direction_set.responses[..., column]
+    replaced_indices = {
+        index
+        for simpler_effect in evaluator.available_effects[name].contains
+        if simpler_effect in model.effects
+        for index in evaluator.get_coefficient_indices(simpler_effect)
+    }
     return (
         model.fit.get_known_jacobian()
         .drop_parameters(replaced_indices)
@@ -277,7 +286,7 @@ def _predict_jacobian(
     )
 
 
-def _list_start_sizes(
+def _list_start_coefficients(
     evaluator: RunEvaluator,
     direction_set: DirectionSet,
     group: DirectionGroup,
@@ -286,14 +295,16 @@ def _list_start_sizes(
 ) -> Iterator[Array]:
     """Yield coefficients of an effect from which its fit may reach different local minima.
 
+    A direction is the response of the runs to a candidate effect.
+
     1. A direction that is valid at one size gives this size, and neighbouring ones for an end stop.
-    2. Otherwise the linear estimate and fractions of it.
+    2. Otherwise the linear estimate and a fraction of it, each also with other event times.
     3. For a single coefficient, also fractions of its plausible range.
 
     Args:
         evaluator: evaluator, which has the bounds of the coefficients.
         direction_set: directions of all candidates about the model.
-        group: directions of the effect at one grid point.
+        group: the columns of `direction_set` that belong to the effect at one choice of its shape.
         estimate: linear estimate of the coefficient of each direction of the group.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
@@ -336,12 +347,13 @@ def _select_nearest_start(
 ) -> list[FitStart]:
     """Simulate all starts, and return the nearest to the data for each score peak.
 
-    Simulating a start costs much less than fitting it.
+    Simulating a start costs much less than fitting it. A score peak is a model with one more effect
+    at one shape of the effect.
 
     Args:
         evaluator: evaluator that simulates the recorded runs.
         noise: noise of each channel.
-        numbered_starts: starts with the number of their score peak.
+        numbered_starts: starts, each with the number of its score peak among those of its effect.
         run_share: fraction of each run, from its beginning, on which the cost is computed.
     """
     if not numbered_starts:
@@ -356,21 +368,22 @@ def _select_nearest_start(
     predictions = evaluator.simulate(theta, run_indices, states, run_share)
     predictions = predictions.reshape(start_count, run_count, *predictions.shape[1:])
     sample_mask = evaluator.get_sample_mask(run_share)
-    best: dict[tuple[int, EffectNames], tuple[float, FitStart]] = {}
-    for (number, start), simulated in zip(numbered_starts, predictions, strict=True):
+    lowest_costs: dict[tuple[int, EffectNames], float] = {}
+    nearest_starts: dict[tuple[int, EffectNames], FitStart] = {}
+    for (peak_number, start), simulated in zip(numbered_starts, predictions, strict=True):
         residual = evaluator.observed - simulated
         normalised_residual = np.where(sample_mask, residual, 0.0) / noise.sigma
         cost = float(np.square(normalised_residual).sum())
-        key = (number, start.effects)
-        lowest_cost = best[key][0] if key in best else np.inf
+        peak = peak_number, start.effects
         # A failed simulation has the cost NaN, which is never the lowest.
-        if cost < lowest_cost:
-            best[key] = cost, start
-    return [start for _, start in best.values()]
+        if cost < lowest_costs.get(peak, np.inf):
+            lowest_costs[peak] = cost
+            nearest_starts[peak] = start
+    return list(nearest_starts.values())
 
 
 def generate_neighbouring_end_stops(
-    evaluator: RunEvaluator, name: str, c: Array
+    evaluator: RunEvaluator, name: str, coefficients: Array
 ) -> Iterator[Array]:
     """Yield end stops (k,) on the same side as a given one; nothing for other effects.
 
@@ -380,10 +393,12 @@ def generate_neighbouring_end_stops(
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-        c: (k,) coefficients of the given end stop.
+        coefficients: (k,) coefficients of the given end stop: the stiffness, positive for the upper
+            and negative for the lower end of the range, then its position.
     """
     if evaluator.available_effects[name].coefficients[0].of == "stop":
-        bound_share = abs(c[0]) / list_coefficients(evaluator, name)[0].bounds[1]
+        stiffness = coefficients[0]
+        bound_share = abs(stiffness) / list_coefficients(evaluator, name)[0].bounds[1]
         # Simulating a robot costs a hundred times as much, so fewer stops are tried.
         stiffness_factors, depth_shares = (
             ((1.0,), END_STOP_DEPTH_SHARES[::2])
@@ -393,38 +408,43 @@ def generate_neighbouring_end_stops(
         yield from generate_end_stops(
             evaluator,
             name,
-            side=np.sign(c[0]),
+            side=np.sign(stiffness),
             stiffness_shares=[bound_share * factor for factor in stiffness_factors],
             depth_shares=depth_shares,
         )
 
 
 def generate_equal_travel_end_stops(
-    evaluator: RunEvaluator, name: str, c: Array
+    evaluator: RunEvaluator, name: str, coefficients: Array
 ) -> Iterator[Array]:
-    """Yield softer and harder end stops (k,) with the same turning point as a given one.
+    """Yield coefficients (k,) of softer and harder end stops with the turning point of a given one.
 
     They are starts for a fit, since stiffness and position of a stop are nearly interchangeable.
-    The depth of contact for a motion of equal energy is proportional to k^(-2/5), with the
-    stiffness k, by eq. (2) of `sims.effects.state_limits`.
+    The depth of contact for a motion of equal energy is proportional to K^(-2/5), with the
+    stiffness K, by eq. (2) of `sims.effects.state_limits`. Nothing is generated for other effects.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-        c: (k,) coefficients of the given end stop.
+        coefficients: (k,) coefficients of the given end stop: the stiffness, positive for the upper
+            and negative for the lower end of the range, then its position.
     """
-    low, high = evaluator.get_coordinate_range(name)
-    if evaluator.available_effects[name].coefficients[0].of != "stop" or not c[0]:
+    if evaluator.available_effects[name].coefficients[0].of != "stop" or not coefficients[0]:
         return
-    end = high if c[0] > 0 else low
+    stiffness, position = coefficients[:2]
+    low, high = evaluator.get_coordinate_range(name)
+    # The motion turns at the end of the recorded range.
+    turning_point = high if stiffness > 0 else low
     for factor in REFIT_STIFFNESS_FACTORS:
-        end_stop = c.copy()
-        end_stop[0] = factor * c[0]
-        end_stop[1] = end - (end - c[1]) * factor**CONTACT_DEPTH_EXPONENT
+        end_stop = coefficients.copy()
+        end_stop[0] = factor * stiffness
+        end_stop[1] = turning_point - (turning_point - position) * factor**CONTACT_DEPTH_EXPONENT
         yield end_stop
 
 
-def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
+def generate_event_times(
+    evaluator: RunEvaluator, name: str, coefficients: Array
+) -> Iterator[Array]:
     """Yield coefficients (k,) with other event times near a given one, between the time stamps.
 
     A fit cannot move an event time over a sample, because the cost has a step there. The times
@@ -434,7 +454,7 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
     Args:
         evaluator: evaluator with the recorded runs.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-        c: (k,) given coefficients.
+        coefficients: (k,) given coefficients, one of which may be an event time in s.
     """
     for i, parameter in enumerate(list_coefficients(evaluator, name)):
         if not is_instant(parameter):
@@ -444,15 +464,14 @@ def generate_event_times(evaluator: RunEvaluator, name: str, c: Array) -> Iterat
             np.concatenate([run_data.scenario.times for run_data in evaluator.prepared_runs])
         )
         midpoints = (stamps[1:] + stamps[:-1]) / 2.0
-        near_midpoints = midpoints[
-            np.abs(midpoints - c[i]) <= (clock_end - clock_start) / (EVENT_TIME_COUNT + 1)
-        ]
+        grid_spacing = (clock_end - clock_start) / (EVENT_TIME_COUNT + 1)
+        near_midpoints = midpoints[np.abs(midpoints - coefficients[i]) <= grid_spacing]
         # At most MAX_EVENT_TIME_SUBDIVISIONS of them, equally spaced.
         stride = -(-near_midpoints.size // MAX_EVENT_TIME_SUBDIVISIONS) or 1
         for instant in near_midpoints[::stride].tolist():
-            coefficients = c.copy()
-            coefficients[i] = instant
-            yield coefficients
+            moved_coefficients = coefficients.copy()
+            moved_coefficients[i] = instant
+            yield moved_coefficients
 
 
 def generate_shifted_starts(evaluator: RunEvaluator, fit: TrajectoryFit) -> Iterator[FitStart]:

@@ -79,7 +79,8 @@ class HeldOutValidation:
         """Return the model without the effects that held-out runs do not confirm.
 
         An effect is not confirmed if it makes held-out predictions worse, or hardly better while
-        the excess is large. Effects are dropped one at a time.
+        the excess residual is large. Effects are dropped one at a time. Only models that were
+        evaluated on held-out runs are compared.
 
         Args:
             search: search with all fitted models.
@@ -123,15 +124,17 @@ class HeldOutValidation:
             for m in fitted_models
             if any(set(m.effects) < set(extension.effects) for extension in extensions)
         ]
-        # The model is included again, so that all initial states start from the same values.
+        # The model is evaluated again: all initial states start from those of the model that
+        # predicts best.
         self.evaluate_models([model, *extensions, *submodels])
-        excess_shares = {
+        relative_excesses = {
             m.effects: self._compute_relative_excess(search, model, m) for m in extensions
         }
-        best = min(extensions, key=lambda m: excess_shares[m.effects], default=model)
-        if best is model or not excess_shares[best.effects] < 1.0:
+        best = min(extensions, key=lambda m: relative_excesses[m.effects], default=model)
+        if best is model or not relative_excesses[best.effects] < 1.0:
             return model
         reduced_model = self.drop_unhelpful_effects(search, best)
+        # The result must still contain the model.
         return reduced_model if names < set(reduced_model.effects) else model
 
     def _compute_relative_excess(
@@ -183,7 +186,8 @@ class HeldOutValidation:
     ) -> bool:
         """Return whether the effect by which two models differ improves held-out predictions.
 
-        One of these criteria must hold:
+        The excess residual is the RMS residual in units of the noise, minus one. One of these
+        criteria must hold:
 
         1. Likelihood and excess residual of held-out runs improve.
         2. They improve a little, and the effect closes most of the gap on the fitted runs.
@@ -196,33 +200,31 @@ class HeldOutValidation:
         """
         before = self.held_out_fits[reduced_model.effects].penalised_log_likelihood
         after = self.held_out_fits[full_model.effects].penalised_log_likelihood
+        excess_before = self.compute_excess_residual(reduced_model.effects)
+        excess_after = self.compute_excess_residual(full_model.effects)
         # 1. Clear improvement.
-        # Both merit and excess are tested, because far from the noise merit alone may be mimicry.
-        excesses = (
-            self.compute_excess_residual(reduced_model.effects),
-            self.compute_excess_residual(full_model.effects),
-        )
-        if improves_held_out((before, after), excesses):
+        # Far from the noise, a higher likelihood alone may only mimic another effect.
+        if improves_held_out((before, after), (excess_before, excess_after)):
             return True
-        excess_without = search.compute_excess_residual(reduced_model)
-        excess_with = search.compute_excess_residual(full_model)
+        fitted_excess_before = search.compute_excess_residual(reduced_model)
+        fitted_excess_after = search.compute_excess_residual(full_model)
         # 2. Small improvement.
         # Errors of a motion without feedback accumulate, whatever their cause.
         is_better = (
-            after > before + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO and excesses[1] < excesses[0]
+            after > before + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO and excess_after < excess_before
         )
-        if is_better and excess_with < CLEARLY_CLOSED * excess_without:
+        if is_better and fitted_excess_after < CLEARLY_CLOSED * fitted_excess_before:
             return True
         # 3. Not visible on held-out runs.
         # A limit that no held-out run approaches cannot be tested there; the result would be
         # random.
-        is_hardly_visible = max(excesses) < HELD_OUT_EXCESS_THRESHOLD and is_indistinguishable(
-            before - after
-        )
+        is_hardly_visible = max(
+            excess_before, excess_after
+        ) < HELD_OUT_EXCESS_THRESHOLD and is_indistinguishable(before - after)
         return (
             is_hardly_visible
-            and excess_without > HELD_OUT_EXCESS_THRESHOLD
-            and explains_gap((excess_without - excess_with) / excess_without)
+            and fitted_excess_before > HELD_OUT_EXCESS_THRESHOLD
+            and explains_gap((fitted_excess_before - fitted_excess_after) / fitted_excess_before)
         )
 
     def has_unexplained_gap(self, model: FittedModel, lack_of_fit: LackOfFitResult) -> bool:

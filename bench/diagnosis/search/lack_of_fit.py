@@ -74,30 +74,37 @@ class JointHatForce(Force):
         """Return the hat force on one joint: its strength times a triangle around the centre.
 
         It acts while time, position or speed is near the centre, eq. (1) of the module docstring.
-        All batch elements of a call have the same joint, variable and direction.
+        The direction is along the joint, against its motion in proportion to speed, or against it
+        as dry friction. All active batch elements of a call have the same joint, variable and
+        direction; the force of the others is zero.
+
+        Shapes: B batch elements, J joints.
 
         Args:
-            c: (7,) coefficients of each batch element: strength, indices of joint and variable,
-                centre, width, index of the direction, and reversal speed.
+            c: (7, B, 1) coefficients: strength, index of the joint, index of the variable (`TIME`,
+                `POSITION`, `SPEED`), centre, half-width, index of the direction (`ALONG`,
+                `AGAINST`, `DRY`), and speed over which dry friction reverses.
             moment: time and joint states of the batch.
 
         Returns:
-            Forces at the joints, zero at all joints but one.
+            Forces (B, J) at the joints, zero at all joints but one.
         """
         strength, joint, variable, centre, width, direction, reversal_speed = c
         active_elements = np.flatnonzero(strength[:, 0])
         if not active_elements.size:
             return np.zeros_like(moment.x)
-        joint_index = int(joint[active_elements[0], 0])
+        joint_index, variable_index, direction_index = (
+            int(indices[active_elements[0], 0]) for indices in (joint, variable, direction)
+        )
         x, v = moment.x[:, joint_index, None], moment.v[:, joint_index, None]
-        variable_index = int(variable[active_elements[0], 0])
+        # In the order of `TIME`, `POSITION` and `SPEED`.
         value = (moment.t, x, np.abs(v))[variable_index]
         # A hat that is off has zero width, which must not be a divisor.
         height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)
+        # Dry friction, whose sign changes smoothly.
         dry_direction = -v / (np.abs(v) + np.maximum(reversal_speed, 1e-9))
-        force_direction = (np.ones_like(v), -v, dry_direction)[
-            int(direction[active_elements[0], 0])
-        ]
+        # In the order of `ALONG`, `AGAINST` and `DRY`.
+        force_direction = (np.ones_like(v), -v, dry_direction)[direction_index]
         forces = np.zeros_like(moment.x)
         forces[:, joint_index] = (strength * height * force_direction)[:, 0]
         return forces
@@ -149,15 +156,22 @@ class HatForce(Force):
         It acts while the variable z (time, position or speed) is near the centre m, with the
         strength c, the half-width w and the direction d.
 
+        Shapes: B batch elements, J axes of the motion.
+
         Args:
-            c: The six coefficients: strength, variable, centre, width, direction, slow (the speed
-                over which dry friction reverses its sign).
-            moment: States of all batch elements at one time.
+            c: (6, B, 1) coefficients: strength, index of the variable (time, speed, then the
+                coordinates), centre, half-width, index of the direction (against the motion in
+                proportion to speed, against it as dry friction, then along each axis), and the
+                speed over which dry friction reverses.
+            moment: states of all batch elements at one time.
+
+        Returns:
+            Forces (B, J).
         """
         strength, variable, centre, width, direction, reversal_speed = c
         axes = moment.x.shape[1]
         variables = [moment.t, moment.speed, *(moment.x[:, k, None] for k in range(axes))]
-        # The batch elements of one call follow different variables; each element has exactly one.
+        # Each batch element has one variable and one direction: all other terms of its sums are 0.
         value = sum(
             np.where(variable == i, variable_value, 0.0)
             for i, variable_value in enumerate(variables)
@@ -230,11 +244,13 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     # 2. Filter.
     force_test = models.score_unmodelled_force(model)
     level = get_structure_threshold(bool(is_noise_stated.all()))
-    # The linear innovations test decides if it finds no force; otherwise the force is simulated.
-    if force_test is not None and force_test[0] > level:
+    if force_test is not None:
         p_value, variable = force_test
-        return replace(size_result, p_value=p_value, where=variable, p_value_threshold=level)
+        # The linear filter decides only if it finds no force; otherwise the force is simulated.
+        if p_value > level:
+            return replace(size_result, p_value=p_value, where=variable, p_value_threshold=level)
     # 3. Hat forces.
+    # Scores need derivatives at the parameters of the model itself.
     model = models.refine_jacobian(model)
     directions = compute_hat_directions(evaluator, model)
     if not directions.candidates:
@@ -282,12 +298,11 @@ def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResul
 
 
 def _compute_sigma_standard_error(models: ModelSet, model: FittedModel, channel: int) -> float:
-    """Return the relative standard error of the estimated noise of a channel, eq. (2).
+    """Return the relative standard error of the estimated noise of a channel.
 
-    Its residual must exceed the noise by a multiple of this error to count as too large.
-
-    For n samples with correlation phi, sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n))
-    (2).
+    The residual of the channel must exceed the noise by a multiple of this error to count as too
+    large. For n samples of AR(1) noise with correlation phi it is, by eq. (2) of the module
+    docstring, sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n)).
 
     Args:
         models: the models, with the mask of recorded samples.
@@ -296,52 +311,62 @@ def _compute_sigma_standard_error(models: ModelSet, model: FittedModel, channel:
     """
     # At a correlation of one, the formula diverges, and no channel would exceed its noise.
     phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
-    count = max(int(models.observed_mask[:, :, channel].sum()), 2)
-    square = phi * phi
-    variance = (1.0 + square) / (1.0 - square) / (2.0 * count)
-    return float(np.sqrt(variance))  # (2)
+    sample_count = max(int(models.observed_mask[:, :, channel].sum()), 2)
+    relative_variance = (1.0 + phi * phi) / (1.0 - phi * phi) / (2.0 * sample_count)
+    return float(np.sqrt(relative_variance))  # (2)
 
 
 def compute_hat_directions(evaluator: RunEvaluator, model: FittedModel) -> DirectionSet:
-    """Compute the responses of a model to hats over every recorded variable.
+    """Compute how the simulated runs respond to hats over every recorded variable.
 
     A hat is a force that acts only in an interval of time, position or speed of the motion.
     Together, hats can represent any force.
 
     Args:
         evaluator: the runs.
-        model: the fitted model.
+        model: fitted model to which each hat is added, one at a time.
+
+    Returns:
+        The K hats that change the runs, and the changes (R, T, C, K) per unit of their strength.
     """
-    probes, size = list_hat_probes(evaluator)
-    names = [
-        JointHatForce.name if JointHatForce.name in evaluator.coefficient_slices else HatForce.name
-    ] * len(probes)
-    added = [(name, probe.coefficients) for name, probe in zip(names, probes, strict=True)]
-    changed = compute_responses(evaluator, model.fit, added)
-    values = np.nan_to_num(np.moveaxis(changed, 0, -1)) / size
+    hats, strength = list_hat_probes(evaluator)
+    is_robot = JointHatForce.name in evaluator.coefficient_slices
+    effect_name = JointHatForce.name if is_robot else HatForce.name
+    changes = compute_responses(
+        evaluator, model.fit, [(effect_name, hat.coefficients) for hat in hats]
+    )
+    # A hat without a finite response counts as one without any.
+    responses = np.nan_to_num(np.moveaxis(changes, 0, -1)) / strength
     # A hat outside the range of all runs changes nothing and would be a column of zeros.
-    active_hats = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
-    return DirectionSet(tuple(probes[i] for i in active_hats), values[..., active_hats])
+    active_hats = np.flatnonzero(np.abs(responses).max(axis=(0, 1, 2)) > 0)
+    return DirectionSet(tuple(hats[i] for i in active_hats), responses[..., active_hats])
 
 
 def list_hat_probes(evaluator: RunEvaluator) -> tuple[list[CandidateDirection], float]:
-    """Return hats over every recorded variable, and their strength.
+    """Return hats over every recorded variable, and the strength that they all have.
 
-    Each family has hats with overlapping triangles over the range of its variable. All hats of a
-    family have the same label, because they form one hypothesis and act together.
+    A hat is a force that depends on one variable by a triangle. The hats of a family overlap and
+    cover the range of their variable. They have the same label, because they form one hypothesis
+    and act together.
     """
-    size = HAT_STRENGTH_SHARE * TYPICAL_FORCES[evaluator.simulator.system.kind]
+    strength = HAT_STRENGTH_SHARE * TYPICAL_FORCES[evaluator.simulator.system.kind]
     is_robot = JointHatForce.name in evaluator.coefficient_slices
     probes = []
     for family in (_iterate_joint_families if is_robot else _iterate_families)(evaluator):
         # With this spacing, each hat extends to the centres of its neighbours.
         width = (family.high - family.low) / (HAT_COUNT - 1)
         for centre in np.linspace(family.low, family.high, HAT_COUNT):
-            coefficients = np.array([size, *family.variable, centre, width, *family.direction])
+            coefficients = np.array([strength, *family.variable, centre, width, *family.direction])
             probes.append(
-                CandidateDirection(family.label, 0, 0, coefficients, can_be_negative=True)
+                CandidateDirection(
+                    effect=family.label,
+                    grid_point=0,
+                    coefficient_index=0,
+                    coefficients=coefficients,
+                    can_be_negative=True,
+                )
             )
-    return probes, size
+    return probes, strength
 
 
 class _HatFamily(NamedTuple):
@@ -366,26 +391,30 @@ class _HatFamily(NamedTuple):
 def _iterate_joint_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
     """Yield every family of hats at the joints of a robot that the recording can show.
 
-    They are forces over time along the coordinate; over the position along it, against the motion,
-    and as dry friction; and over the speed against the motion and as dry friction.
+    A hat is a force that depends on one variable by a triangle max(1 - |z - m| / w, 0). For each
+    recorded joint, the families are forces
+
+    * over time, along the joint;
+    * over its position, along the joint, against the motion, or as dry friction;
+    * over its speed, against the motion or as dry friction.
     """
     for joint, name, low, high in _iterate_positions(evaluator):
         speeds = np.abs(_compute_rates(evaluator, evaluator.channels.index(name)))
         speed = float(np.nanquantile(speeds, HIGH_SPEED_QUANTILE))
         reversal_speed = SIGN_CHANGE_SPEED_SHARE * speed
         duration = evaluator.longest_duration
-        along = f"time, along {name}"
-        yield _HatFamily(along, (joint, TIME), 0.0, duration, (ALONG, reversal_speed))
-        directions = {ALONG: "along it", AGAINST: "against it", DRY: "dry"}
-        for direction, text in directions.items():
-            acting = direction, reversal_speed
-            if high > low:
+        yield _HatFamily(
+            f"time, along {name}", (joint, TIME), 0.0, duration, (ALONG, reversal_speed)
+        )
+        opposing_directions = {AGAINST: "against it", DRY: "dry"}
+        if high > low:
+            for direction, text in {ALONG: "along it", **opposing_directions}.items():
                 label = f"position {name}, {text}"
-                yield _HatFamily(label, (joint, POSITION), low, high, acting)
-        for direction, text in directions.items():
-            acting = direction, reversal_speed
-            if speed > 0 and direction != ALONG:
-                yield _HatFamily(f"speed of {name}, {text}", (joint, SPEED), 0.0, speed, acting)
+                yield _HatFamily(label, (joint, POSITION), low, high, (direction, reversal_speed))
+        if speed > 0:
+            for direction, text in opposing_directions.items():
+                label = f"speed of {name}, {text}"
+                yield _HatFamily(label, (joint, SPEED), 0.0, speed, (direction, reversal_speed))
 
 
 def _iterate_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
@@ -402,6 +431,7 @@ def _iterate_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
     """
     system = evaluator.simulator.system
     speed = _compute_high_speed(evaluator)
+    # Each direction has its index and the speed over which dry friction reverses.
     against, dry, *axes = [
         (direction, SIGN_CHANGE_SPEED_SHARE * speed)
         for direction in range(AXIS_DIRECTION + len(system.coordinates))
@@ -443,7 +473,13 @@ def _iterate_positions(evaluator: RunEvaluator) -> Iterator[tuple[int, str, floa
 
 
 def _compute_rates(evaluator: RunEvaluator, channel: int) -> Array:
-    """Return the rates of a channel in all runs, from differences of its recorded values."""
+    """Return the rates of a channel in all runs (n,), from differences of its recorded values.
+
+    Args:
+        evaluator: evaluator with the recorded runs.
+        channel: index of the channel.
+    """
+    # A zero, so that there is a rate even if all runs are too short.
     rates = [np.zeros(1)]
     for run_data in evaluator.prepared_runs:
         if len(run_data.observed) > 3:
@@ -454,17 +490,17 @@ def _compute_rates(evaluator: RunEvaluator, channel: int) -> Array:
 
 
 def _compute_high_speed(evaluator: RunEvaluator) -> float:
-    """Return the 98 % quantile of the speed, from the rates of the recorded coordinates.
+    """Return the 98 % quantile of the speed over all runs; 0 if no coordinate is recorded.
 
-    It is the upper end of the hats over speed; a quantile, because single differences may be noise.
-    Without recorded coordinates there is no speed.
+    The speed is the norm of the rates of the recorded coordinates. The quantile is the upper end of
+    the hat forces over speed. The maximum is not used, because a single rate may be noise.
     """
     channels = evaluator.channels
-    squares = [
+    squared_rates = [
         np.square(_compute_rates(evaluator, channels.index(name)))
         for name in evaluator.simulator.system.coordinates
         if name in channels
     ]
-    if not squares:
+    if not squared_rates:
         return 0.0
-    return float(np.sqrt(np.nanquantile(sum(squares), HIGH_SPEED_QUANTILE)))
+    return float(np.sqrt(np.nanquantile(sum(squared_rates), HIGH_SPEED_QUANTILE)))

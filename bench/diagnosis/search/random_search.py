@@ -45,7 +45,7 @@ EXPLAINED_SQUARES = 1.05
 """Mean square of the residual, in units of the noise, at which the search ends."""
 
 
-class FoundValues(NamedTuple):
+class BestSample(NamedTuple):
     """Best sample of a search.
 
     Attributes:
@@ -60,7 +60,10 @@ class FoundValues(NamedTuple):
 
 
 class RandomSearch:
-    """Search about given coefficients and smoothed first states of all runs.
+    """Random search of coefficients, and of the initial states of all runs.
+
+    The initial state of a run is its smoothed mean plus a root of its covariance times a deviate,
+    so that deviates are standard normal at first.
 
     Args:
         evaluator: the runs.
@@ -76,27 +79,23 @@ class RandomSearch:
         smoothed: Sequence[SmoothedStart],
         rng: np.random.Generator,
     ) -> None:
-        """Begin with the smoothed states, whose deviates are normalised by their covariances.
-
-        Initial states are sampled as mean plus root times deviate, so deviates are standard normal
-        at first.
+        """Begin at the smoothed initial states, with deviates zero and covariance one.
 
         Args:
-            evaluator: Run evaluator of the recording.
+            evaluator: run evaluator of the recording.
             sigma: (C,) standard deviation of the noise of each channel.
-            smoothed: Smoothed initial state of each run, mean and covariance.
-            rng: Random generator.
+            smoothed: smoothed initial state of each run, mean and covariance.
+            rng: random generator.
         """
         self._evaluator, self._sigma, self._rng = evaluator, sigma, rng
         self._means = [one.mean for one in smoothed]
         self._roots = [compute_root(one.covariance[None])[0] for one in smoothed]
+        # Of each run: the best deviate so far (s,), and the covariance of the next deviates.
         self._deviates = [np.zeros(mean.size) for mean in self._means]
         self._covariances = [np.eye(mean.size) for mean in self._means]
         self._is_recorded = np.isfinite(evaluator.observed)
 
-    def run(
-        self, theta: Array, indices: Sequence[int], widths: Array, bounds: Array
-    ) -> FoundValues:
+    def run(self, theta: Array, indices: Sequence[int], widths: Array, bounds: Array) -> BestSample:
         """Search coefficients and initial states at random, and return the best sample.
 
         It minimises J(c) = sum over runs r of min_x J_r(c, x), eq. (1), with the coefficients c and
@@ -123,21 +122,23 @@ class RandomSearch:
             self._evaluator.search_control.check_not_stopped()
             # 1. Coefficients.
             deviates = self._rng.standard_normal((COEFFICIENT_SAMPLES, len(indices)))
+            # The best coefficients so far are tried again, with other initial states.
             deviates[0] = 0.0
             values = np.clip(centre + spread * deviates, bounds[:, 0], bounds[:, 1])
             samples = np.repeat(theta[None], COEFFICIENT_SAMPLES, axis=0)
             samples[:, list(indices)] = values
             # 2. Initial states.
+            # For each run, the deviates and the costs of all initial states.
             sampled_states = [self._sample_states(run, samples) for run in range(len(self._means))]
             totals = np.sum([costs.min(axis=1) for _, costs in sampled_states], axis=0)  # (1)
             # 3. Best sample.
-            index, previous_lowest = int(np.argmin(totals)), lowest_cost
-            if totals[index] < lowest_cost:
-                lowest_cost = float(totals[index])
-                best_theta = samples[index]
-                centre = values[index]
-                for run, (states, costs) in enumerate(sampled_states):
-                    self._deviates[run] = states[index, np.argmin(costs[index])]
+            best, previous_lowest = int(np.argmin(totals)), lowest_cost
+            if totals[best] < lowest_cost:
+                lowest_cost = float(totals[best])
+                best_theta = samples[best]
+                centre = values[best]
+                for run, (state_deviates, costs) in enumerate(sampled_states):
+                    self._deviates[run] = state_deviates[best, np.argmin(costs[best])]
             # 4. Convergence.
             if not lowest_cost < (1.0 - MIN_COST_DECREASE) * previous_lowest:
                 break
@@ -147,34 +148,34 @@ class RandomSearch:
             order = np.argsort(totals)[:BEST_COEFFICIENTS]
             deviation = np.sqrt(np.square(values[order] - centre).mean(axis=0))
             spread = np.minimum(spread, SPREAD_FACTOR * deviation)
-            for run, (states, costs) in enumerate(sampled_states):
-                self._move_covariance(run, states, costs)
-        sampled_initial_states = [
+            for run, (state_deviates, costs) in enumerate(sampled_states):
+                self._update_covariance(run, state_deviates, costs)
+        best_states = [
             mean + root @ deviate
             for mean, root, deviate in zip(self._means, self._roots, self._deviates, strict=True)
         ]
         evaluator = self._evaluator
-        states = np.where(
-            evaluator.known_state_mask, evaluator.initial_state_guesses, sampled_initial_states
-        )
-        return FoundValues(best_theta, states, lowest_cost / max(sample_count, 1))
+        states = np.where(evaluator.known_state_mask, evaluator.initial_state_guesses, best_states)
+        return BestSample(best_theta, states, lowest_cost / max(sample_count, 1))
 
     def _sample_states(self, run: int, samples: Array) -> tuple[Array, Array]:
         """Simulate one run from random initial states, with each of N samples of the parameters.
 
-        A cost is the sum of squares of the residual plus that of the deviates, which penalises
-        initial states far from the smoothed ones. Returned are the deviates (N, M, s) of M initial
-        states, and their costs (N, M).
+        An initial state is mean + root @ deviate, with the mean and the root of the covariance of
+        the smoothed initial state. For each sample of the parameters, the best deviate so far is
+        tried, and M - 1 random ones about it. States that are known are not varied.
 
         Shapes: P parameters, s states of a run.
 
         Args:
-            run: Index of the run.
+            run: index of the run.
             samples: (N, P) samples of the parameters.
 
         Returns:
-            Deviates (N, M, s) of the initial states, and costs (N, M): sums of squares of the
-            residual and of the deviates, which are as uncertain as the prior of the fit.
+            Deviates (N, M, s), and costs (N, M): sums of squares of the residual, in units of the
+            noise, and of the deviates, in standard deviations of the prior of the fit. The prior is
+            wider than the smoothed covariance by `FIRST_STATE_MARGIN`. A failed simulation has an
+            infinite cost.
         """
         mean, root = self._means[run], self._roots[run]
         shape = (len(samples), STATE_SAMPLES, mean.size)
@@ -195,15 +196,21 @@ class RandomSearch:
         costs = squares + np.square(deviates / FIRST_STATE_MARGIN).sum(axis=2)
         return deviates, np.where(np.isfinite(costs), costs, np.inf)
 
-    def _move_covariance(self, run: int, deviates: Array, costs: Array) -> None:
-        """Take the covariance of the best deviates (N, M, s) about the best one.
+    def _update_covariance(self, run: int, deviates: Array, costs: Array) -> None:
+        """Adapt the covariance of the next deviates of a run to the best deviates of this round.
 
-        A share of the previous covariance is kept. N values of the parameters are combined with M
-        initial states with s components.
+        It becomes the covariance of the best deviates about the best one of all rounds. A share of
+        the previous covariance is added, so that the search does not become too narrow.
+
+        Args:
+            run: index of the run.
+            deviates: (N, M, s) deviates of M initial states for each of N samples of the
+                parameters.
+            costs: (N, M) their costs.
         """
         order = np.argsort(costs, axis=None)[:BEST_STATES]
-        differences = deviates.reshape(-1, deviates.shape[2])[order] - self._deviates[run]
+        best_deviates = deviates.reshape(-1, deviates.shape[2])[order]
+        differences = best_deviates - self._deviates[run]
         covariance = differences.T @ differences / len(order)
-        self._covariances[run] = (1.0 - KEPT_SHARE) * covariance + KEPT_SHARE * self._covariances[
-            run
-        ]
+        previous = self._covariances[run]
+        self._covariances[run] = (1.0 - KEPT_SHARE) * covariance + KEPT_SHARE * previous

@@ -18,7 +18,13 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
     """Return the largest values that the limited quantity of an effect reaches in the runs.
 
     A limit above such a value changes nothing, so the search tries fractions of it. The quantity
-    is, for example, the input, its rate, or the error of a servo.
+    follows from the kind of the first coefficient (`Coefficient.of`):
+
+    * an input, its rate or acceleration, the error of a servo, or a level: the largest one in the
+      recorded runs;
+    * the travel of a joint, for backlash: its largest recorded range;
+    * a compliance ("give"), the force of a drive, or a level that is not recorded: the largest
+      plausible coefficient, because the range of the quantity is not recorded.
 
     Args:
         evaluator: evaluator with the recorded runs.
@@ -34,7 +40,6 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
         # The coefficients after the first one are shape parameters.
         return np.array([list_coefficients(evaluator, name)[0].bounds[1]])
     if kind == "drive" or (kind == "level" and not _get_limited_channel(evaluator, effect)):
-        # The range of the quantity is not recorded, so the plausible range is used.
         return np.array([p.bounds[1] for p in list_coefficients(evaluator, name)])
     if kind == "travel":
         return np.array([evaluator.get_effect_travel(name)])

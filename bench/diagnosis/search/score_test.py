@@ -106,8 +106,10 @@ def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
 def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
     """Collect groups with equal sign constraints in batches, so that one call solves all of them.
 
+    The groups of a batch also have the same number of columns, one for each sign constraint.
+
     Args:
-        members: Groups of directions. Those whose coefficients must be positive have constraints.
+        members: groups of directions that act together.
     """
     groups_by_signs: dict[tuple[bool, ...], list[int]] = {}
     for i, group in enumerate(members):
@@ -165,7 +167,8 @@ def compute_explained_squares(
 def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array, Array]:
     """Find, for each group and residual, the subset of columns that explains most.
 
-    A subset counts only if its constrained coefficients are not negative.
+    A subset counts only if its constrained coefficients are not negative. The explained sum of
+    squares of a subset is h'G^-1 h, with G and h of its columns.
 
     Args:
         gram: (n, k, k) inner products G of the k directions of each of n groups.
@@ -187,11 +190,11 @@ def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> t
         if constrained:
             is_better &= (solution.scaled[:, constrained] >= 0).all(axis=1)
         best[solution.groups] = np.where(is_better, solution.gain, previous_best)
-        # Columns outside the subset get zero coefficients.
-        is_improved = is_better[:, 0]
-        rows = solution.groups[is_improved]
-        coefficients[rows] = 0.0
-        coefficients[rows[:, None], subset] = solution.coefficients[is_improved]
+        # Coefficients for the first residual; columns outside the subset get zero.
+        is_better_for_first = is_better[:, 0]
+        improved_groups = solution.groups[is_better_for_first]
+        coefficients[improved_groups] = 0.0
+        coefficients[improved_groups[:, None], subset] = solution.coefficients[is_better_for_first]
     return best, coefficients
 
 
@@ -499,13 +502,15 @@ class _BestScores:
             coefficients: (n, k) coefficients of the groups for the first residual, the observed
                 one.
         """
+        # Best group of each effect: groups are sorted by effect, and reduced effect by effect.
         effect_rows = self._effect_rows[batch.group_indices]
         order = np.argsort(effect_rows, kind="stable")
-        present_rows, first_of_effect = np.unique(effect_rows[order], return_index=True)
+        batch_rows, first_of_effect = np.unique(effect_rows[order], return_index=True)
         largest_squares = np.maximum.reduceat(gain[order], first_of_effect, axis=0)
-        self._explained_squares[present_rows] = np.maximum(
-            self._explained_squares[present_rows], largest_squares
+        self._explained_squares[batch_rows] = np.maximum(
+            self._explained_squares[batch_rows], largest_squares
         )
+        # Best correlation of each group.
         log_likelihoods = self._compute_log_likelihood(
             self._total_squares[0] - gain[:, 0], self._total_squares[0]
         )
@@ -537,8 +542,9 @@ class _BestScores:
         """Return the scores of eq. (4) in descending order, with the p-value of eq. (5).
 
         A score is the largest l(phi) of the effect's groups minus the largest l(phi) without any
-        direction (4). The p-value is the share of surrogates whose best score, relative to the 90 %
-        quantile of its effect, is at least the observed one (5).
+        direction (4), where l is twice the log-likelihood and phi the AR(1) correlation. The
+        p-value is the probability that the best score of a surrogate, relative to the 90 % quantile
+        of its effect, is at least the observed one (5).
         """
         gains = self._best_log_likelihoods - self._best_without_effects  # (4)
         observed = gains[:, 0]
@@ -555,6 +561,7 @@ class _BestScores:
         null_scores = surrogate_gains - null_quantiles[:, None]
         order = np.argsort(-observed, kind="stable")
         phi = 0.0
+        # The correlation of the noise is that of the best group of the best effect.
         if order.size:
             members = np.flatnonzero(self._effect_rows == order[0])
             phi = float(self._group_phis[members[np.argmax(self._group_log_likelihoods[members])]])
@@ -572,9 +579,15 @@ class _BestScores:
     def _get_peaks(self, group_indices: NDArray[np.intp]) -> tuple[ScorePeak, ...]:
         """Return the groups of an effect from which its fit may start, the best first.
 
-        Each has the coefficients of its columns. This is the best group of the effect. An effect
-        with many shapes, such as frequencies, may have several local maxima of the likelihood; then
-        the best of them are returned. `group_indices` are the groups of the effect.
+        A group has the directions of one shape, such as one frequency. Usually only the best group
+        is returned. An effect with many shapes may have several local maxima of the likelihood over
+        its shapes; then the best of them are returned.
+
+        Args:
+            group_indices: indices of the groups of the effect, in the order of its shapes.
+
+        Returns:
+            Groups, each with the coefficients of its columns.
         """
         values = self._group_log_likelihoods[group_indices]
         has_many_shapes = len(group_indices) > SHAPE_COUNT_FOR_MULTISTART
@@ -582,9 +595,7 @@ class _BestScores:
         if has_many_shapes:
             # Neighbours of the best group give the same result, so only local maxima count.
             padded = np.concatenate([[-np.inf], values, [-np.inf]])
-            above_previous = values >= padded[:-2]
-            above_next = values >= padded[2:]
-            is_peak = above_previous & above_next
+            is_peak = (values >= padded[:-2]) & (values >= padded[2:])
         order = np.argsort(-values, kind="stable")
         max_peaks = STARTS_PER_EFFECT if has_many_shapes else 1
         peak_groups = [group_indices[i] for i in order if is_peak[i]][:max_peaks]

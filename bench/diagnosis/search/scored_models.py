@@ -134,8 +134,9 @@ class ScoredModelSet(ModelSet):
     ) -> CandidateScores:
         """Score every effect that the model lacks, to find the effects that are worth fitting.
 
-        A score is the gain of an effect to first order, without a fit. The scores about a model are
-        computed once and stored, except with a `noise_residual`.
+        A score is the gain of an effect to first order, without a fit. Surrogates are random noise
+        that calibrates the scores. The scores about a model are computed once and stored. With a
+        `noise_residual` they are computed anew, and replace the stored ones.
 
         Shapes: R runs, T samples, C channels.
 
@@ -151,8 +152,8 @@ class ScoredModelSet(ModelSet):
             return self.scores_by_effects[key]
         stored_scan = self.cached_scans[key]
         self._report_scoring(model)
-        # Directions cost one simulation per candidate, and are reused with other surrogates. The
-        # spectrum of the noise is best estimated from a model with less structure in its residual.
+        # The directions (responses of the runs to the effects) cost one simulation for each
+        # candidate, and are reused with other surrogates.
         residual = self.compute_residual(model.fit)
         rng = self.make_rng("library", model.effects)
         scores = _score_residual(
@@ -166,6 +167,9 @@ class ScoredModelSet(ModelSet):
     ) -> None:
         """Score the effects that each of the models lacks, in parallel, and store the results.
 
+        Directions are the responses of the simulated runs to the effects; scores compare them with
+        the residual.
+
         1. If a model was replaced by nearly the same fit, its stored directions are used again.
         2. The directions of the other models are simulated, one model in each worker.
         3. The oldest directions are removed if they take too much memory.
@@ -174,7 +178,7 @@ class ScoredModelSet(ModelSet):
             models: models to score.
             other_kept_models: further models whose stored results must not be removed.
         """
-        scan_arguments, keys = [], []
+        scan_arguments, keys, effect_counts = [], [], []
         for model in models:
             self._report_scoring(model)
             model = self.refine_jacobian(model)
@@ -193,11 +197,14 @@ class ScoredModelSet(ModelSet):
                 )
                 self._store_scores(key, previous_scan._replace(scores=scores))
                 continue
+            missing_effects = self._list_addable_effects(model)
             keys.append(key)
+            effect_counts.append(len(missing_effects))
+            # Arguments of `_scan_model` in a worker.
             scan_arguments.append(
                 (
                     model.fit,
-                    self._list_addable_effects(model),
+                    missing_effects,
                     self.compute_channel_weights(model),
                     residual,
                     self.observed_mask,
@@ -206,12 +213,11 @@ class ScoredModelSet(ModelSet):
             )
         # 2. The other models.
         if scan_arguments:
-            max_effects = max(len(missing_effects) for _, missing_effects, *_ in scan_arguments)
             further_text = (
                 f" added to each of {len(scan_arguments)} models" if len(scan_arguments) > 1 else ""
             )
             self.evaluator.search_control.begin_stage(
-                f"testing {max_effects} effects{further_text}", len(scan_arguments)
+                f"testing {max(effect_counts)} effects{further_text}", len(scan_arguments)
             )
         scans = {}
         for model_index, scan in self.evaluator.worker_pool.map_unordered(
@@ -220,8 +226,8 @@ class ScoredModelSet(ModelSet):
             scans[model_index] = scan
             self.evaluator.search_control.advance()
         for model_index, key in enumerate(keys):
+            # Stored scores remain valid if only the directions of the model were removed.
             scores = self.scores_by_effects.get(key, scans[model_index].scores)
-            # Scores that were kept when the directions were removed remain valid.
             self._store_scores(key, scans[model_index]._replace(scores=scores))
         # 3. Memory.
         self._limit_cache_size([*keys, *(frozenset(model.effects) for model in other_kept_models)])
@@ -275,7 +281,8 @@ class ScoredModelSet(ModelSet):
     def _compute_fit_distance(self, first: TrajectoryFit, second: TrajectoryFit) -> float:
         """Return the RMS difference of two simulations over all samples, in units of the noise.
 
-        If it is small, directions about the first fit are also valid for the second.
+        If it is small, responses to effects that were computed about the first fit are also valid
+        for the second.
 
         Args:
             first: fit about which directions were computed.
@@ -301,9 +308,11 @@ class ScoredModelSet(ModelSet):
     ) -> None:
         """Fit the models with one more effect that have the highest scores, and store them.
 
-        Scores are linear, so the best candidates are fitted by simulation. For robots, models with
-        simpler laws are fitted first, and those with richer laws only if the simpler ones leave
-        more than noise: laws that are evaluated in every step cost most.
+        Scores are linear, so the best candidates are fitted by simulation. For robots, this is done
+        in two steps, because richer laws cost more simulation time:
+
+        1. Fit models with laws of which no simpler law is known.
+        2. Fit models with richer laws, if the models with the simpler ones leave more than noise.
 
         Args:
             beam: models to extend (the best ones of the beam search).
@@ -317,16 +326,19 @@ class ScoredModelSet(ModelSet):
                 self.refit_models(starts, is_staged=fits_all)
             return
         known_models = {frozenset(start.effects) for start in starts} | set(self.models)
-        simpler_models = {
-            id(start): self._list_simpler_models(start) & known_models for start in starts
-        }
-        simple_starts = [start for start in starts if not simpler_models[id(start)]]
+        # Each start with its models in which a simpler law replaces one of its laws.
+        starts_and_simpler = [
+            (start, self._list_simpler_models(start) & known_models) for start in starts
+        ]
+        # 1. Simple laws.
+        simple_starts = [start for start, simpler in starts_and_simpler if not simpler]
         if simple_starts:
             self.refit_models(simple_starts)
+        # 2. Richer laws.
         richer_starts = [
             start
-            for start in starts
-            if simpler_models[id(start)] and not self._leaves_only_noise(simpler_models[id(start)])
+            for start, simpler in starts_and_simpler
+            if simpler and not self._leaves_only_noise(simpler)
         ]
         if richer_starts:
             self.refit_models(richer_starts)
@@ -336,8 +348,8 @@ class ScoredModelSet(ModelSet):
     ) -> list[FitStart]:
         """Return starts of fits of each model of the beam with one more effect.
 
-        Starting values of the effect are those with the best score. Models without stored
-        directions are scored first.
+        Starting values of the effect are those with the best score. Models whose scores are not
+        stored are scored first.
 
         Args:
             beam: the models to extend.
@@ -407,9 +419,12 @@ class ScoredModelSet(ModelSet):
         """Return the p-value of the gain of a model with more effects.
 
         A small value means that the smaller model lacks an effect. The null hypothesis is that it
-        lacks none. Surrogates of the noise have the spectrum of a residual. That of the smaller
-        model contains what an effect explains, so it makes large gains seem likely. If its p-value
-        does not decide, the residual of the larger model is used, which is closer to pure noise.
+        lacks none. The gain is compared with those from surrogates: random noise with the spectrum
+        of a residual.
+
+        1. Use the spectrum of the residual of the smaller model. It contains what an effect
+           explains, so it makes large gains seem likely; a very small p-value decides nevertheless.
+        2. Otherwise use the residual of the larger model, which is closer to pure noise.
 
         Args:
             model: model with fewer effects.
@@ -418,17 +433,18 @@ class ScoredModelSet(ModelSet):
         gain = larger.likelihood.value - model.likelihood.value
         # The given model may be a refit, while the scores belong to the fit of the search.
         model = self.models[frozenset(model.effects)]
-        first = self.compute_gain_p_value(self.score_missing_effects(model), larger, gain)
-        # Such a gain is significant whatever the spectrum of the surrogates.
-        if first < CERTAIN_P_VALUE:
-            return first
+        # 1. Residual of the smaller model.
+        p_value = self.compute_gain_p_value(self.score_missing_effects(model), larger, gain)
+        if p_value < CERTAIN_P_VALUE:
+            return p_value
+        # 2. Residual of the larger model.
         scores = self.score_missing_effects(model, self.compute_residual(larger.fit))
         return min(scores.p_value, self.compute_gain_p_value(scores, larger, gain))
 
     def compute_gain_p_value(
         self, scores: CandidateScores, larger: FittedModel, gain: float
     ) -> float:
-        """Return the p-value of a gain in twice the log-likelihood.
+        """Return the p-value of a gain in twice the log-likelihood, compared with surrogate noise.
 
         An effect with many shapes gains more from pure noise. So the gain that the larger model's
         effects reach under the null hypothesis (90 % quantile over the surrogates) is subtracted

@@ -71,7 +71,7 @@ def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
 
 
 def _compute_factor(run: Run) -> int:
-    """Return the number of sample intervals within one engine step."""
+    """Return the number of sample intervals within one step of the simulator, at least 1."""
     intervals = np.diff(run.times)
     if not intervals.size:
         return 1
@@ -82,35 +82,37 @@ def _compute_factor(run: Run) -> int:
 def _take_every_nth(run: Run, factor: int) -> Run:
     """Return the run with every n-th sample of its channels; n is `factor`.
 
-    An input becomes its mean between the kept samples, so that it has the same effect.
+    An input becomes its mean between the kept samples, so that it has the same effect. Columns that
+    are neither channels nor inputs (`extra`) are left out.
     """
-    first = np.arange(0, run.times.size, factor)
+    kept = np.arange(0, run.times.size, factor)
     return replace(
         run,
-        times=run.times[first],
-        channels={name: values[first] for name, values in run.channels.items()},
+        times=run.times[kept],
+        channels={name: values[kept] for name, values in run.channels.items()},
         inputs={
-            name: _average_input(run.times, values, first) for name, values in run.inputs.items()
+            name: _average_input(run.times, values, kept) for name, values in run.inputs.items()
         },
         extra={},
     )
 
 
-def _average_input(times: Array, values: Array, first: Indices) -> Array:
+def _average_input(times: Array, values: Array, kept: Indices) -> Array:
     """Return the mean (K,) of an input over the samples from each kept sample to the next one.
 
     Args:
         times: (T,) sample times in seconds.
         values: (T,) input, held from each sample to the next one.
-        first: (K,) indices of the kept samples.
+        kept: (K,) indices of the kept samples.
 
     Returns:
         Means, weighted by duration; after the last kept sample, the mean of the rest of the run.
     """
     durations = np.diff(times, append=times[-1])
-    # The last sample has no duration; a tiny one avoids 0 / 0 in its block.
+    # The last sample has no duration; a tiny one avoids 0 / 0 if it is a kept sample.
     durations[-1] = 1e-9 * max(float(times[-1] - times[0]), 1e-9)
-    means: Array = np.add.reduceat(values * durations, first) / np.add.reduceat(durations, first)
+    # Sums from each kept sample to the next one.
+    means: Array = np.add.reduceat(values * durations, kept) / np.add.reduceat(durations, kept)
     return means
 
 
@@ -171,8 +173,8 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
     4. If all samples show more effects, repeat the search on them.
     """
     # 1. No effect.
-    # If the scores of the base model, which all merits need anyway, show nothing, no search is
-    # needed.
+    # The scores of the base model are needed in any case, to penalise effects with many shapes. If
+    # they show nothing, `run` returns the base model at once.
     if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
         return search.run()
     # 2. Subsampled runs.
@@ -205,9 +207,13 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
 
 
 def _adopt_subsampled_models(search: EffectSearch, model: FittedModel) -> None:
-    """Store the model that the thinned runs support; simulate it on all samples without a fit.
+    """Adopt the best model of a search on thinned runs, which had to end early.
 
-    It is used if the time limit ends the search on the thinned runs.
+    It is simulated on all samples without a fit, for which there is no time.
+
+    Args:
+        search: search on all samples, in which the model is stored.
+        model: best model of the search on thinned runs.
     """
     fitter = TrajectoryFitter(search.evaluator, search.noise, search.fixed_parameters)
     (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)

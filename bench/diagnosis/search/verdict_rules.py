@@ -7,7 +7,7 @@ RMS minus one, so it is 0 for a model whose residual is only noise.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -76,8 +76,8 @@ BORDERING: str = (
 """Meaning of `partial` if a base parameter is at a bound of its range."""
 FAULTY: str = "the recording states a wrong unit or sign; correct it and run again"
 """Meaning of `unknown` for a recording with a wrong unit or sign."""
-REQUIRED_QUESTIONS: Collection[str] = frozenset({"structure", "alternatives"})
-"""Questions that need not be answered for a cause to be accepted."""
+OPTIONAL_QUESTIONS: frozenset[str] = frozenset({"structure", "alternatives"})
+"""Questions of a search that may stay open if a cause is accepted after an early stop."""
 
 
 def is_motionless(
@@ -85,7 +85,8 @@ def is_motionless(
 ) -> bool:
     """Return whether a recording shows no motion and the model expects none.
 
-    Both are required, because a body that rests where it should fall is a discrepancy.
+    Both are required, because a body that rests where it should fall is a discrepancy. A recording
+    whose channels are all constant shows no motion in any case.
 
     Args:
         ranges: (C,) maximum minus minimum of each channel.
@@ -98,8 +99,9 @@ def is_motionless(
         (ranges < MIN_MOTION_SIGMAS * sigma).all()
         and (residual_sigma < MAX_RESIDUAL_SIGMAS_AT_REST * sigma).all()
     )
-    # A completely constant recording contains no information, whatever the model expects.
-    return (is_at_rest and not is_model_sensitive) or not ranges.any()
+    is_constant = not ranges.any()
+    # A constant recording contains no information, whatever the model expects.
+    return is_constant or (is_at_rest and not is_model_sensitive)
 
 
 def is_identified(sd: float, low: float, high: float) -> bool:
@@ -172,17 +174,20 @@ def is_unexplained(structure: bool, p_value: float) -> bool:
 def improves_held_out(likelihoods: tuple[float, float], excesses: tuple[float, float]) -> bool:
     """Return whether an effect improves the prediction of held-out runs.
 
-    Far from the noise, the excess must decrease clearly, because a small gain in merit may only
-    mimic another missing effect.
+    The likelihood must increase. Far from the noise, the excess residual must also decrease
+    clearly, because a small gain in likelihood may only mimic another missing effect.
 
     Args:
-        likelihoods: merit without the effect, and with it.
-        excesses: excess without the effect, and with it.
+        likelihoods: penalised log-likelihood of the held-out runs without the effect, and with it.
+        excesses: excess residual (RMS in units of the noise, minus one) without the effect, and
+            with it.
     """
-    # Near the noise only the merit decides, because 10 % of a very small excess is meaningless.
-    before, after = excesses
-    return likelihoods[1] > likelihoods[0] and (
-        before < HELD_OUT_EXCESS_THRESHOLD or after < (1.0 - MIN_HELD_OUT_IMPROVEMENT) * before
+    likelihood_without, likelihood_with = likelihoods
+    excess_without, excess_with = excesses
+    # Near the noise only the likelihood decides: 10 % of a very small excess is meaningless.
+    return likelihood_with > likelihood_without and (
+        excess_without < HELD_OUT_EXCESS_THRESHOLD
+        or excess_with < (1.0 - MIN_HELD_OUT_IMPROVEMENT) * excess_without
     )
 
 
@@ -196,15 +201,16 @@ def is_indistinguishable(distance: float) -> bool:
 
 
 def convert_excess_ratio(ratios: Sequence[float]) -> float:
-    """Return the distance of two models on the scale of `is_indistinguishable`, from excesses.
+    """Convert ratios of excess residuals to a difference in twice the log-likelihood.
 
-    A ratio of excesses of `INDISTINGUISHABLE_EXCESS_RATIO` is equivalent to
-    `INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO`:
+    Both are distances of two models, and `is_indistinguishable` has a threshold of 7 for the
+    difference. A ratio of 1.2 is as indistinguishable:
 
-        behind = SWITCH mean(log ratios) / log SIMILAR                                         (1)
+        difference = 7 mean(log ratios) / log 1.2                                              (1)
 
     Args:
-        ratios: excess of the model divided by that of the other one, for each part of the data.
+        ratios: for each part of the data (fitted runs, held-out runs), the excess residual of the
+            worse model divided by that of the better one.
     """
     return (
         INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
@@ -236,16 +242,17 @@ def misses_held_out_gap(before: float, after: float) -> bool:
     """Return whether held-out runs show a discrepancy that the model does not remove.
 
     In this case something acts there that the fitted runs do not show: the excess is too large, or
-    too little of the excess of the base model is removed.
+    too little of the excess of the base model is removed. The excess is the RMS residual in units
+    of the noise, minus one.
 
     Args:
         before: excess of the base model on held-out runs.
         after: excess of the extended model on held-out runs.
     """
-    gap_closed = before - max(after, 0.0)
+    decrease = before - max(after, 0.0)
     # The comparison is negated, so that the NaN of a failed simulation counts as missed.
     return not after < UNSEEN_EFFECT_EXCESS or (
-        before > UNSEEN_EFFECT_EXCESS and gap_closed < MIN_GAP_CLOSED * before
+        before > UNSEEN_EFFECT_EXCESS and decrease < MIN_GAP_CLOSED * before
     )
 
 
@@ -254,58 +261,61 @@ class DiagnosisState:
     """Answers to all questions, from which the verdict follows.
 
     Attributes:
-        fixed: whether the data determine the sensitive base parameters.
-        causes: number of causes found.
-        alternatives: whether at least one cause has an indistinguishable alternative.
-        closed: share of the discrepancy on the fitted runs that the causes remove.
-        unexplained: whether the model with the causes still lacks something on the fitted runs.
-        missed: whether held-out runs show a discrepancy that the model does not remove.
+        is_base_determined: whether the data determine the sensitive base parameters.
+        cause_count: number of causes found.
+        has_alternatives: whether at least one cause has an indistinguishable alternative.
+        gap_closed: share of the discrepancy on the fitted runs that the causes remove.
+        is_unexplained: whether the model with the causes still lacks something on the fitted runs.
+        misses_held_out_gap: whether held-out runs show a discrepancy that the model does not
+            remove.
     """
 
-    fixed: bool = True
-    causes: int = 0
-    alternatives: bool = False
-    closed: float = 0.0
-    unexplained: bool = False
-    missed: bool = False
+    is_base_determined: bool = True
+    cause_count: int = 0
+    has_alternatives: bool = False
+    gap_closed: float = 0.0
+    is_unexplained: bool = False
+    misses_held_out_gap: bool = False
 
 
 def decide_verdict(state: DiagnosisState) -> VerdictName:
     """Return the verdict that follows from the answers; the first rule that applies decides.
 
     Args:
-        state: Answers to the questions of the diagnosis: is the base model determined, does
-            anything remain unexplained, how much of the gap is closed, and which causes and
-            alternatives were found.
+        state: answers to the questions of the diagnosis: is the base model determined, does
+            anything remain unexplained, how much of the gap is closed, how many causes were found,
+            and have they alternatives.
+
+    Returns:
+        "unidentifiable", "unknown", "adequate", "partial", "ambiguous" or "named".
     """
     # If the base model is not determined, every cause could be a wrong parameter value.
-    if not state.fixed:
+    if not state.is_base_determined:
         return "unidentifiable"
-    incomplete = state.unexplained or state.missed
-    if not state.causes:
+    incomplete = state.is_unexplained or state.misses_held_out_gap
+    if not state.cause_count:
         return "unknown" if incomplete else "adequate"
-    # Causes that leave most of the discrepancy mimic what is missing; they are listed, but not
-    # accepted.
-    if not explains_gap(state.closed):
+    # Causes that leave most of the discrepancy mimic what is missing: the report lists them, but
+    # does not accept them.
+    if not explains_gap(state.gap_closed):
         return "unknown"
     # Incompleteness comes before alternatives, because a set of causes is only valid for a complete
     # answer.
     if incomplete:
         return "partial"
-    return "ambiguous" if state.alternatives else "named"
+    return "ambiguous" if state.has_alternatives else "named"
 
 
-def verdict_of_numbers(verdict: VerdictName, results: bool) -> VerdictName:
-    """Return the verdict when the fitted coefficients of the causes are known.
+def verdict_of_numbers(verdict: VerdictName, are_results: bool) -> VerdictName:
+    """Replace the verdict "named" by "partial" if the coefficients of the causes are no results.
 
-    A coefficient at a bound of its range or without a finite interval is not a result, so its cause
-    is not named.
+    A coefficient at a bound of its range or without a finite interval is not a result.
 
     Args:
         verdict: verdict by all other rules.
-        results: whether every coefficient of the causes without alternatives is a result.
+        are_results: whether every coefficient of the causes without alternatives is a result.
     """
-    return "partial" if verdict == "named" and not results else verdict
+    return "partial" if verdict == "named" and not are_results else verdict
 
 
 def decide_early_stop_verdict(
@@ -313,9 +323,9 @@ def decide_early_stop_verdict(
 ) -> VerdictName:
     """Return the verdict of a search that ended early, which claims only what was tested.
 
-    If a question is open, the verdict is neither adequate nor named. Causes are accepted if they
-    were compared with their competing models and on held-out runs; otherwise they are listed, but
-    not accepted.
+    Causes are accepted ("partial") if they were compared with their competing models and on
+    held-out runs, so that only `OPTIONAL_QUESTIONS` are open, and if they explain the discrepancy.
+    Otherwise the verdict is "unknown".
 
     Args:
         causes: number of causes found.
@@ -323,5 +333,5 @@ def decide_early_stop_verdict(
             counted as structure.
         skipped_questions: the open questions.
     """
-    has_required_answers = all(name in REQUIRED_QUESTIONS for name in skipped_questions)
+    has_required_answers = OPTIONAL_QUESTIONS.issuperset(skipped_questions)
     return "partial" if causes and has_required_answers and explains_gap(gap_closed) else "unknown"

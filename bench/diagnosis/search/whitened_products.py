@@ -54,14 +54,14 @@ class LaggedSums(NamedTuple):
 
         It is ((1 + phi^2) sum a_t b_t - phi sum a_t (b_{t-1} + b_{t+1}) - phi^2 sum n_t a_t b_t) /
         (1 - phi^2), with the AR(1) correlation phi and n_t the number of missing neighbours of
-        sample t.
+        sample t. The three sums are `same_samples`, `neighbours` and `run_ends`.
         """
         square = phi * phi
         scaled_products = (
             (1.0 + square) * self.same_samples - phi * self.neighbours - square * self.run_ends
         )
-        result: Array = scaled_products / (1.0 - square)  # (1)
-        return result
+        products: Array = scaled_products / (1.0 - square)  # (1)
+        return products
 
 
 class RunSegment(NamedTuple):
@@ -126,6 +126,9 @@ def add_cross_products(
 ) -> None:
     """Add the products of all columns of one set with all columns of another, over one segment.
 
+    These are the three sums of eq. (1) of the module docstring, from which the inner product of
+    whitened columns follows for any correlation.
+
     Args:
         sums: sums to add to, in place.
         first: columns of the first set.
@@ -133,7 +136,7 @@ def add_cross_products(
         segment: section of a run, with its samples that lack neighbours.
     """
     sums.same_samples[...] += first.samples @ np.swapaxes(second.samples, -1, -2)
-    # Summed over a run, it does not matter to which of the two columns the neighbours belong.
+    # Summed over a run, sum a_t (b_t-1 + b_t+1) is symmetric in a and b.
     sums.neighbours[...] += first.samples @ np.swapaxes(second.neighbour_sums, -1, -2)
     sums.run_ends[...] += (first.edge_samples * segment.missing_neighbours) @ np.swapaxes(
         second.edge_samples, -1, -2
@@ -261,8 +264,9 @@ class WhiteningDesign:
     ) -> SegmentColumns:
         """Return weighted samples of one section, and the sums of their two neighbours in time.
 
-        These are the factors of the products in eq. (1). The weights are 1 / sigma of each channel,
-        and zero where no sample exists.
+        Products of these give the sums of eq. (1): a_t b_t, a_t (b_t-1 + b_t+1), and a_t b_t at
+        samples that lack a neighbour. The weights are 1 / sigma of each channel, and zero where no
+        sample exists.
 
         Shapes: R runs, T samples, C channels.
 
@@ -273,12 +277,14 @@ class WhiteningDesign:
         """
         run, begin, end = segment.run, segment.begin, segment.end
         column_count = len(values)
-        # Include one more sample on either side, as a neighbour of the outermost samples.
+        # Include one more sample on either side, if it exists, as a neighbour of the outermost
+        # ones.
         first, last = (max(begin - 1, 0), end + 1) if has_neighbours else (begin, end)
         extended_samples = values[:, run, first:last] * self._weights[run, first:last]
         samples = extended_samples[:, begin - first : end - first]
         neighbour_sums = np.zeros_like(samples)
         if has_neighbours:
+            # At an end of the run, the outermost sample has no neighbour on this side.
             previous_samples = extended_samples[:, : end - first - 1]
             neighbour_sums[:, samples.shape[1] - previous_samples.shape[1] :] += previous_samples
             next_samples = extended_samples[:, begin - first + 1 :]
@@ -298,12 +304,12 @@ class WhiteningDesign:
         3. The products of directions that act together (a block).
 
         Args:
-            segment: Section of a run, with its samples that lack neighbours.
+            segment: section of a run, with its samples that lack neighbours.
         """
         jacobian_columns = self._weight_columns(self._jacobian, segment)
         direction_columns = self._weight_columns(self._directions, segment)
+        # 1. Jacobian.
         add_cross_products(
-            # 1. Jacobian.
             select_run(self._jacobian_products, segment.run),
             jacobian_columns,
             jacobian_columns,
@@ -365,7 +371,10 @@ class WhiteningDesign:
         return squares, shared, cross
 
     def project_out(self, residuals: Array) -> Array:
-        """Return the residuals of a least-squares fit of parameters and initial states.
+        """Return what remains of residuals after a fit of parameters and initial states.
+
+        The fit is linear least squares. Parameters are shared by all runs, and each run has its own
+        initial states.
 
         1. Project the residuals on the derivatives by the initial states and the parameters.
         2. Solve for the parameters, then for the initial states of each run (back substitution).
@@ -377,6 +386,7 @@ class WhiteningDesign:
             residuals: (S, R, T, C) residuals before the fit.
         """
         # 1. Projections.
+        # White noise: the fit weights the samples by the noise of their channel only.
         reduced_design = self.reduce(0.0)
         parameter_count = self._parameter_count
         weighted = self._jacobian * self._weights
@@ -388,8 +398,6 @@ class WhiteningDesign:
         )
         by_states, by_parameters = _project_residuals(reduced_design, shared)
         # 2. Coefficients.
-        # Back substitution: first coefficients of the parameters, then of the initial states of
-        # each run.
         parameters = reduced_design.parameter_root @ by_parameters
         state_products = (
             by_states - reduced_design.state_projections[:, :parameter_count] @ parameters
@@ -418,9 +426,11 @@ class WhiteningDesign:
     def _whiten_and_project(self, phi: float) -> _ReducedDesign:
         """Whiten the design with the correlation phi, and project it by eq. (2).
 
-        The products of two columns become a'b - (L'J'a)'(L'J'b), eq. (2), with the Jacobian J and L
-        L' = (J'J)^-1. So only the part of a direction that parameters and initial states cannot
-        absorb remains.
+        The design has the derivatives by parameters and initial states (J) and the directions of
+        effects. The products of two columns become a'b - (L'J'a)'(L'J'b), eq. (2), with L L' =
+        (J'J)^-1. So only the part of a direction that parameters and initial states cannot absorb
+        remains. `normal` has the products J'J (R, q + s, q + s), and `mixed` those of J with the K
+        directions (R, q + s, K).
 
         1. Whiten all products with phi.
         2. Project out the initial states of each run, then the parameters of all runs.
@@ -433,8 +443,7 @@ class WhiteningDesign:
         mixed = self._direction_products.combine(phi)
         powers = self._direction_squares.combine(phi)
 
-        # 2. Projection.
-        # Eq. (2) for the initial states of each run, then for the parameters.
+        # 2. Projection: L'J'a of the initial states, then of the parameters.
         state_root = _compute_matrix_root(normal[:, parameter_count:, parameter_count:])
         other_products = np.concatenate(
             [normal[:, parameter_count:, :parameter_count], mixed[:, parameter_count:]], axis=2
@@ -525,20 +534,19 @@ def _flatten(values: Array) -> Array:
 
 
 def _project_residuals(reduced_design: _ReducedDesign, shared: Array) -> tuple[Array, Array]:
-    """Return L'J'e of eq. (2) for initial states (R s, S) and for parameters (q, S).
+    """Return L'J'e of S residuals e, for initial states (R s, S) and for parameters (q, S).
 
-    The squares of these are the part of the residuals that initial states and parameters absorb.
+    L is a root of (J'J)^-1, with the Jacobian J. The squares of the results are the part of the sum
+    of squares of e that initial states and parameters absorb, eq. (2) of the module docstring.
 
     Shapes: R runs, q fitted parameters, s states of a run.
-
-    The projection subtracts (L'J'a)'(L'J'b) from a'b (2).
 
     Args:
         reduced_design: Jacobian and directions after whitening and projection.
         shared: (R, q + s, S) products J'e of the Jacobian with the residuals.
     """
     parameter_count = len(reduced_design.parameter_root)
-    # First the initial states of each run, then the parameters.
+    # First the initial states of each run, then the parameters, with what the states leave.
     by_states = _project_directions(reduced_design.state_roots, shared[:, parameter_count:])
     parameter_products = (
         shared[:, :parameter_count].sum(axis=0)
@@ -548,13 +556,12 @@ def _project_residuals(reduced_design: _ReducedDesign, shared: Array) -> tuple[A
 
 
 def _project_directions(roots: Array, products: Array) -> Array:
-    """Multiply the products J'a of each run by the root L', as needed in eq. (2).
+    """Multiply the products J'a of each run by the root L', for the projection of eq. (2).
 
-    Eq. (2) subtracts (L'J'a)'(L'J'b), the part of a'b that the initial states absorb.
+    The projection subtracts (L'J'a)'(L'J'b), the part of a'b that the initial states absorb. J are
+    the derivatives by the initial states.
 
     Shapes: R runs, s states of a run.
-
-    The projection subtracts (L'J'a)'(L'J'b) from a'b (2).
 
     Args:
         roots: (R, s, s) L of each run.

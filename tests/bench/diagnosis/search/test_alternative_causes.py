@@ -37,7 +37,7 @@ def evidence(
     effects = {name: placed(coordinate=joint) for joint, name in enumerate("abc")}
     search.evaluator = SimpleNamespace(
         available_effects=effects,
-        coefficient_slices=slots,
+        get_coefficient_indices=lambda name: range(slots[name].stop),
         has_linearisation=False,
         simulator=SimpleNamespace(system=SimpleNamespace(loops=loops)),
     )

@@ -76,7 +76,7 @@ def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
     inquiry = Inquiry(search, None)
     inquiry._model = found
     if held_out:
-        inquiry._trial = SimpleNamespace(
+        inquiry._held_out_validation = SimpleNamespace(
             find_better_extension=lambda search, model: fuller, evaluate_models=measured.extend
         )
     taken = inquiry._accept_larger_model(SimpleNamespace(has_structure=structure))

@@ -138,19 +138,24 @@ def test_the_error_on_held_out_runs_follows_from_the_residual_or_the_remaining_g
     ("state", "verdict"),
     [
         (DiagnosisState(), "adequate"),
-        (DiagnosisState(fixed=False), "unidentifiable"),
-        (DiagnosisState(fixed=False, causes=1, closed=0.9), "unidentifiable"),
-        (DiagnosisState(unexplained=True), "unknown"),
-        (DiagnosisState(missed=True), "unknown"),
-        (DiagnosisState(causes=1, closed=0.71), "named"),
-        (DiagnosisState(causes=3, closed=0.71), "named"),
-        (DiagnosisState(causes=1, closed=0.69), "unknown"),
-        (DiagnosisState(causes=1, closed=0.71, alternatives=True), "ambiguous"),
-        (DiagnosisState(causes=1, closed=0.71, unexplained=True), "partial"),
-        (DiagnosisState(causes=1, closed=0.71, missed=True), "partial"),
-        (DiagnosisState(causes=1, closed=0.71, alternatives=True, unexplained=True), "partial"),
-        (DiagnosisState(causes=1, closed=0.69, missed=True), "unknown"),
-        (DiagnosisState(causes=1, closed=0.69, alternatives=True), "unknown"),
+        (DiagnosisState(is_base_determined=False), "unidentifiable"),
+        (DiagnosisState(is_base_determined=False, cause_count=1, gap_closed=0.9), "unidentifiable"),
+        (DiagnosisState(is_unexplained=True), "unknown"),
+        (DiagnosisState(misses_held_out_gap=True), "unknown"),
+        (DiagnosisState(cause_count=1, gap_closed=0.71), "named"),
+        (DiagnosisState(cause_count=3, gap_closed=0.71), "named"),
+        (DiagnosisState(cause_count=1, gap_closed=0.69), "unknown"),
+        (DiagnosisState(cause_count=1, gap_closed=0.71, has_alternatives=True), "ambiguous"),
+        (DiagnosisState(cause_count=1, gap_closed=0.71, is_unexplained=True), "partial"),
+        (DiagnosisState(cause_count=1, gap_closed=0.71, misses_held_out_gap=True), "partial"),
+        (
+            DiagnosisState(
+                cause_count=1, gap_closed=0.71, has_alternatives=True, is_unexplained=True
+            ),
+            "partial",
+        ),
+        (DiagnosisState(cause_count=1, gap_closed=0.69, misses_held_out_gap=True), "unknown"),
+        (DiagnosisState(cause_count=1, gap_closed=0.69, has_alternatives=True), "unknown"),
     ],
 )
 def test_the_first_question_answered_decides(state, verdict):
