@@ -128,17 +128,19 @@ def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[Integrator
     (`RELATIVE_RK4_COST`).
 
     Args:
-        model_settings: Time step, integrator and options of the model file.
+        model_settings: time step, integrator and options of the model file.
     """
     step, integrator, *_ = model_settings
-    cost = {"RK4": RELATIVE_RK4_COST}
-    settings_by_cost = []
-    for parts in (1, 2, 5, MAX_STEP_DIVISIONS):
+    relative_costs = {"RK4": RELATIVE_RK4_COST}
+    # Cost, divisor of the step, and integrator.
+    settings_with_cost = []
+    for divisor in (1, 2, 5, MAX_STEP_DIVISIONS):
         for name in dict.fromkeys((integrator, STIFF_INTEGRATOR, "RK4")):
-            if (parts, name) != (1, integrator):
-                settings_by_cost.append((parts * cost.get(name, 1.0), parts, name))
-    for _, parts, name in sorted(settings_by_cost, key=lambda entry: entry[0]):
-        yield model_settings._replace(timestep=step / parts, integrator=name)
+            if (divisor, name) != (1, integrator):
+                settings_with_cost.append((divisor * relative_costs.get(name, 1.0), divisor, name))
+    settings_with_cost.sort(key=lambda entry: entry[0])
+    for _, divisor, name in settings_with_cost:
+        yield model_settings._replace(timestep=step / divisor, integrator=name)
 
 
 def simulate_with_settings(
@@ -202,7 +204,7 @@ class _ReferenceMotions:
         Shapes: R runs, T samples, C channels.
 
         Args:
-            model_settings: Time step, integrator and options of the model file.
+            model_settings: time step, integrator and options of the model file.
         """
 
         def simulate(integrator: str, divisor: int) -> Array:
@@ -215,6 +217,7 @@ class _ReferenceMotions:
             coarse, refined = (simulate(STIFF_INTEGRATOR, k) for k in (divisor, 2 * divisor))
             return 2.0 * refined - coarse
 
+        # Divisors of the time step to try; each is compared with a step of half the size.
         for divisors, get_motion in (
             ((1, 2, 5), partial(simulate, "RK4")),
             ((2, 5), extrapolate),
@@ -239,14 +242,15 @@ class _ReferenceMotions:
             first: (R, T, C) simulated channels of the checked runs.
             second: (R, T, C) the same channels, simulated with other settings.
         """
-        observed_masks = [np.isfinite(run_data.observed) for run_data in self._checked_runs]
         squares = []
-        for run, observed_mask in enumerate(observed_masks):
+        for run, run_data in enumerate(self._checked_runs):
+            observed_mask = np.isfinite(run_data.observed)
+            # Runs are padded to equal length.
             samples = slice(len(observed_mask))
             difference = (first[run, samples] - second[run, samples]) / self._noise.sigma
             squares.append(np.square(difference[observed_mask]))
-        size = float(np.sqrt(np.concatenate(squares).mean()))
-        return size if np.isfinite(size) else float("inf")
+        rms = float(np.sqrt(np.concatenate(squares).mean()))
+        return rms if np.isfinite(rms) else float("inf")
 
 
 def correct_discretisation(
@@ -254,9 +258,11 @@ def correct_discretisation(
 ) -> None:
     """Correct all later simulations for the discretisation error at a model near the data.
 
-    An error below `MAX_CORRECTABLE_ERROR` is not reported as a cause, but an effect could imitate
-    it: for example dry friction that stops within a step and not at its end, or a servo that is
-    nearly too fast for the step. With the motion q(h) at step size h, the discretisation error is
+    The correction is stored in the evaluator, which adds it to its simulations. An error below
+    `MAX_CORRECTABLE_ERROR` is not reported as a cause, but an effect could imitate it: for example
+    dry friction that stops within a step and not at its end, or a servo that is nearly too fast for
+    the step. A larger error is not corrected. With the motion q(h) at step size h, the
+    discretisation error is
 
         2 q(h / 4) - q(h / 2) - q(h)                                                           (2)
 
@@ -289,6 +295,5 @@ def correct_discretisation(
     evaluator.simulation_count += 7 * run_count
     correction = 2.0 * simulated[2] - simulated[1] - simulated[0]  # (2)
     squared_errors = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]
-    # A large error cannot be removed by this correction.
     if float(np.sqrt(squared_errors.mean())) < MAX_CORRECTABLE_ERROR:
         evaluator.discretisation_correction = np.nan_to_num(correction)

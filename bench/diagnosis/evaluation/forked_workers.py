@@ -192,7 +192,7 @@ class ForkedWorkerPool:
         A forked worker inherits the run evaluators of `register` without a copy, so that tasks
         can refer to them by number. Its main function is `_run_worker`.
         """
-        # One byte of memory that all workers share: not zero if they must stop their tasks.
+        # One byte of memory that all workers share: a value other than zero asks them to stop.
         if self._stop_flag is None:
             self._stop_flag = mmap.mmap(-1, 1)
         context = multiprocessing.get_context("fork")
@@ -239,8 +239,9 @@ class ForkedWorkerPool:
         """
         # Error and traceback by item number.
         errors: dict[int, tuple[Exception, str]] = {}
-        # Numbers of the items, the next one last; working pipes with their item; idle pipes.
+        # Numbers of the items, the next one last.
         unprocessed = list(range(len(items)))[::-1]
+        # Pipes of working workers with the number of their item, and pipes of idle workers.
         busy: dict[Connection, int] = {}
         idle = [worker.pipe for worker in self._workers]
         # Workers know the run evaluator by its index.
@@ -255,6 +256,7 @@ class ForkedWorkerPool:
                 if _send(pipe, (evaluator_index, task, items[item_index])):
                     busy[pipe] = item_index
                 else:
+                    # The worker is gone, so another one gets its item.
                     self._kill_worker(pipe)
                     unprocessed.append(item_index)
             # 2. No workers.
@@ -337,10 +339,12 @@ class _Pickler(pickle.Pickler):
         """Pickle an array that is not C-contiguous together with the order of its axes in memory.
 
         Pickle itself would not keep every memory order. All other objects are pickled as usual,
-        which `NotImplemented` requests.
+        which `NotImplemented` requests. Otherwise the result is a function that restores the array,
+        and its arguments.
         """
         if type(value) is not np.ndarray or value.ndim < 2 or value.flags.c_contiguous:
             return NotImplemented
+        # The axis with the largest stride (in bytes) is the outermost one in memory.
         order = np.argsort([-abs(stride) for stride in value.strides], kind="stable")
         return _restore_axes, (np.ascontiguousarray(value.transpose(order)), np.argsort(order))
 
@@ -391,7 +395,7 @@ def _run_worker(
 
     1. Make sure that the worker ends with its parent, and that only the parent handles Ctrl-C.
     2. Receive a request: the index of a run evaluator, a task (a function) and its arguments.
-    3. Run the task, with the deadline of the search.
+    3. Run the task, with the deadline of the search. It ends early if the parent sets `stop_flag`.
     4. Send the result or the error, and the number of simulations.
 
     Args:
@@ -411,6 +415,7 @@ def _run_worker(
         return
     for other_pipe in other_pipes:
         other_pipe.close()
+    # Tasks within a task run in this process.
     for evaluator in evaluators:
         evaluator.worker_pool = ForkedWorkerPool()
     # 2. Requests.
@@ -420,10 +425,11 @@ def _run_worker(
         except (EOFError, OSError):
             return
         evaluator = evaluators[evaluator_index]
-        deadline = evaluators[evaluator_index].search_control.deadline
+        # 3. Task.
+        # A new search control for each task, which knows the stop flag and keeps the deadline.
+        deadline = evaluator.search_control.deadline
         evaluator.search_control = SearchControl(stop=lambda: stop_flag[0] != 0)
         evaluator.search_control.deadline = deadline
-        # 3. Task.
         count_before = evaluator.simulation_count
         result, error, trace = None, None, ""
         try:

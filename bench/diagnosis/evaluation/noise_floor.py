@@ -72,19 +72,18 @@ def compute_noise_floor(evaluator: RunEvaluator, recording: Recording) -> NoiseF
     sigmas, is_stated, steps, uncertainties = [], [], [], []
     for channel in evaluator.simulator.channels:
         signals = [(run.times, run.channels[channel.name]) for run in recording.runs]
-        samples = [y[np.isfinite(y)] for _, y in signals]
-        values = np.concatenate(samples)
+        values = np.concatenate([samples[np.isfinite(samples)] for _, samples in signals])
         # Estimate also if the noise is specified, because the step shows whether the channel is
         # quantised.
         estimate = estimate_noise(signals)
         is_specified = recording.noise.get(channel.name, 0.0) > 0
         sigma = recording.noise[channel.name] if is_specified else estimate.sigma
 
-        # No simulation is accurate enough for a noise floor of zero.
-        min_sigma = max(INTEGRATION_ERROR_SHARE * compute_value_range(values), MIN_SIGMA)
         # There may be too few samples; a channel that never changes does not show its noise.
         if not np.isfinite(sigma) or (not is_specified and is_constant(values)):
             sigma = DEFAULT_FLOOR_SHARE * channel.scale
+        # No simulation is accurate enough for a noise floor of zero.
+        min_sigma = max(INTEGRATION_ERROR_SHARE * compute_value_range(values), MIN_SIGMA)
         sigmas.append(max(sigma, min_sigma))
         is_stated.append(is_specified)
         steps.append(estimate.step)
@@ -149,23 +148,25 @@ def _compute_added_noise(recording: Recording, name: str) -> float:
     """Return the standard deviation of noise to add to a channel; 0 if it needs none.
 
     A channel that is noisy, quantised or constant needs none. A noise-free one (from a simulation)
-    would make every tiny integration error significant.
+    would make every tiny integration error significant, so noise of the size of these errors is
+    added.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
         name: name of the channel.
     """
     signals = [(run.times, run.channels[name]) for run in recording.runs if name in run.channels]
-    values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
-    min_sigma = INTEGRATION_ERROR_SHARE * compute_value_range(values)
-    if min_sigma < MIN_SIGMA:
+    values = np.concatenate([samples[np.isfinite(samples)] for _, samples in signals])
+    added_sigma = INTEGRATION_ERROR_SHARE * compute_value_range(values)
+    # A constant channel.
+    if added_sigma < MIN_SIGMA:
         return 0.0
     # A quantised channel has the noise of its steps, also while the robot rests.
-    if estimate_noise(signals).step > min_sigma:
+    if estimate_noise(signals).step > added_sigma:
         return 0.0
     # The estimate is not finite if all runs are too short for the differences.
     sigma = estimate_differences_sigma(signals, DIFFERENCE_ORDER)
-    return min_sigma if sigma < MAX_NOISE_FREE_SHARE * min_sigma else 0.0
+    return added_sigma if sigma < MAX_NOISE_FREE_SHARE * added_sigma else 0.0
 
 
 def _add_noise(run: Run, sizes: dict[str, float]) -> Run:
@@ -177,22 +178,10 @@ def _add_noise(run: Run, sizes: dict[str, float]) -> Run:
         run: the run.
         sizes: standard deviation by channel; other channels stay as they are.
     """
-
-    def noise(name: str, values: Array) -> Array:
-        """Draw white noise for a channel from a random stream of its own.
-
-        `sizes` has the standard deviation by channel, and `run` is the run that gets the noise.
-
-        Args:
-            name: name of the channel.
-            values: (T,) recorded values, of which only the shape counts.
-        """
-        return sizes[name] * make_rng("least noise", run.log, run.name, name).normal(
-            size=values.shape
-        )
-
-    channels = {
-        name: values + noise(name, values) if name in sizes else values
-        for name, values in run.channels.items()
-    }
+    channels = dict(run.channels)
+    for name, sigma in sizes.items():
+        if name in channels:
+            # Each channel has a random stream of its own.
+            rng = make_rng("least noise", run.log, run.name, name)
+            channels[name] = channels[name] + sigma * rng.normal(size=channels[name].shape)
     return replace(run, channels=channels)

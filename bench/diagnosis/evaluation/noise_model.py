@@ -199,10 +199,11 @@ def _maximise_channel_likelihood(
 ) -> tuple[float, float, float]:
     """Return the maximum of eq. (4) for one channel, with its correlation and variance.
 
-    With n samples, m of them with a predecessor, and the mean square v of the whitened values for
-    sigma = 1, 2 log L = -n log v - m log(1 - phi^2) - n. It counts all samples, because Schwarz's
-    criterion has a separate penalty for fitted parameters. The variance is estimated with the
-    remaining degrees of freedom.
+    With n samples, m of them with a predecessor, and the mean square v of the values whitened with
+    sigma = 1 and the AR(1) correlation phi, 2 log L = -n log v - m log(1 - phi^2) - n, eq. (4) of
+    the module docstring. The last term is left out, because it is the same for all models. The
+    likelihood counts all samples, because Schwarz's criterion has a separate penalty for fitted
+    parameters. The variance is estimated with the remaining degrees of freedom.
 
     Shapes: R runs, T samples.
 
@@ -210,6 +211,9 @@ def _maximise_channel_likelihood(
         residual: (R, T, 1) residual.
         observed_mask: (R, T, 1) mask of available samples.
         share: remaining degrees of freedom, as a fraction of the samples.
+
+    Returns:
+        Twice the log-likelihood, the correlation phi and the variance.
     """
     sample_count = int(observed_mask.sum())
     best = (-np.inf, 0.0, 0.0)
@@ -217,11 +221,11 @@ def _maximise_channel_likelihood(
         whitened = whiten(residual, observed_mask, _make_unit_noise(phi))
         sum_of_squares = float((whitened * whitened).sum())
         variance = max(sum_of_squares / sample_count, MIN_VARIANCE)
-        # Equation (4) with the determinant of whitening.
+        # -m log(1 - phi^2) of eq. (4).
         determinant = 2.0 * compute_log_determinant(observed_mask, phi)
         value = -sample_count * np.log(variance) + determinant
-        hypothesis = (value, phi, variance / share)
-        best = max(best, hypothesis)
+        # Tuples are compared by the likelihood first.
+        best = max(best, (value, phi, variance / share))
     return best
 
 
@@ -229,7 +233,7 @@ def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
     """Return the AR(1) correlations φ at which the likelihood of a channel is computed.
 
     They are near the sample correlation of the residual, where the maximum is. Zero (white noise)
-    is always included, so that it wins if the likelihood hardly differs.
+    is always included.
 
     Shapes: R runs, T samples.
 
@@ -247,7 +251,6 @@ def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
     )
     candidate_phis = sample_phi + np.array(PHI_OFFSETS)
     clipped_phis = np.clip(candidate_phis, MIN_PHI, MAX_PHI)
-    # White noise is always one of the hypotheses.
     correlations: Array = np.unique(np.append(clipped_phis, 0.0))
     return correlations
 
@@ -288,23 +291,23 @@ def compute_portmanteau_p_value(
     return min(1.0, min_p_value * len(likelihood.phi))
 
 
-def _compute_ljung_box_sum(w: Array, count: int) -> float:
+def _compute_ljung_box_sum(whitened: Array, count: int) -> float:
     """Return the sum Σ r_k² / (n - k) of the Ljung-Box test of `compute_portmanteau_p_value`.
 
-    r_k is the autocorrelation of the whitened values at lag k.
+    r_k is the autocorrelation of the whitened values at lag k, and n the number of samples. With R
+    runs, n - k becomes n - R k, because no pair of samples spans two runs.
 
     Shapes: R runs, T samples.
 
     Args:
-        w: (R, T) whitened values of a channel, zero where no sample exists.
+        whitened: (R, T) whitened values of a channel, zero where no sample exists.
         count: n, the number of samples.
     """
-    runs, length = w.shape
-    power = max(float((w * w).sum()), MIN_VARIANCE)
+    runs, length = whitened.shape
+    sum_of_squares = max(float((whitened * whitened).sum()), MIN_VARIANCE)
     total = 0.0
     for lag in range(1, min(PORTMANTEAU_LAGS, length - 1) + 1):
-        products = w[:, lag:] * w[:, :-lag]
-        correlation = float(products.sum()) / power
-        # Each run starts separately, so `lag` pairs are lost in every run.
+        products = whitened[:, lag:] * whitened[:, :-lag]
+        correlation = float(products.sum()) / sum_of_squares
         total += correlation**2 / max(count - lag * runs, 1)
     return total

@@ -66,19 +66,18 @@ def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[tuple
     The plausible range of a coefficient ranks causes, and values outside it are reported, but it
     does not override the data. So a fit has wider limits:
 
-    * limits of physics (`Coefficient.least` and `most`): totals of friction, damping, inertia and
-      mass are not negative;
-    * otherwise, a multiple of the plausible range;
-    * zero for a coefficient that is nonnegative by definition, and the range of a shape parameter.
+    * the plausible range itself for a shape parameter, such as a frequency;
+    * otherwise, a multiple of the plausible range, which keeps a lower bound of zero;
+    * in any case within the limits of physics (`Coefficient.least` and `most`): totals of friction,
+      damping, inertia and mass are not negative.
 
     Args:
         evaluator: evaluator, which has the coefficients of all effects.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     effect = evaluator.available_effects[name]
-    pairs = zip(
-        evaluator.parameters[evaluator.coefficient_slices[name]], effect.coefficients, strict=False
-    )
+    # Each coefficient as a parameter of the evaluator, and as the effect declares it.
+    pairs = zip(list_coefficients(evaluator, name), effect.coefficients, strict=False)
     return [
         _restrict_to_physical(
             _compute_fit_bounds(parameter, coefficient, effect, evaluator), coefficient
@@ -136,10 +135,13 @@ def bound_of(value: float, low: float, high: float) -> Bound | None:
         high: upper end of the range.
     """
     tolerance = BOUND_TOLERANCE * (high - low)
-    # A range may be a thousand times as wide as the distance of its bound from zero.
+    # A range may be a thousand times as wide as the distance of its bound from zero, so the
+    # tolerance is also limited by this distance. A bound of zero must be reached exactly.
     if value <= low + min(tolerance, RELATIVE_BOUND_TOLERANCE * abs(low)):
         return "low"
-    return "high" if value >= high - min(tolerance, RELATIVE_BOUND_TOLERANCE * abs(high)) else None
+    if value >= high - min(tolerance, RELATIVE_BOUND_TOLERANCE * abs(high)):
+        return "high"
+    return None
 
 
 def _restrict_to_physical(
@@ -212,12 +214,13 @@ def list_coefficients(evaluator: RunEvaluator, name: str) -> Sequence[Parameter]
 def compute_range_around(evaluator: RunEvaluator, place: int, value: float | None = None) -> Bounds:
     """Return the range of a base parameter, widened until it contains a value.
 
-    It is widened at most `MAX_WIDENING_ROUNDS` times.
+    It is widened at most `MAX_WIDENING_ROUNDS` times, and not beyond physical limits, so that it
+    need not contain the value.
 
     Args:
         evaluator: run evaluator of the runs to which models are fitted.
         place: index of the parameter.
-        value: value that the range must contain; None for the widest range.
+        value: value that the range should contain; None for the widest range.
     """
     parameter = evaluator.parameters[place]
     limits = get_physical_limits(evaluator, place)
@@ -231,6 +234,8 @@ def compute_range_around(evaluator: RunEvaluator, place: int, value: float | Non
 
 def use_bounds(evaluator: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> None:
     """Replace the ranges of parameters of a run evaluator.
+
+    The narrower ranges that some parameters have for training (`training`) are dropped.
 
     Args:
         evaluator: the runs for fitting; its parameters are replaced.
@@ -249,25 +254,27 @@ def use_bounds(evaluator: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> Non
 def get_physical_limits(evaluator: RunEvaluator, place: int) -> Bounds:
     """Return the physical limits of a base parameter; for a robot, those of its total value.
 
-    For example, a mass cannot be negative. A robot's free number is a correction of a number in its
-    model file; without an upper limit it is limited to a multiple of its plausible range.
+    For example, a mass cannot be negative. A robot's free number is fitted as an effect that
+    corrects a number of its model file. Without an upper limit of the total, it is limited to a
+    multiple of its plausible range.
 
     Args:
         evaluator: run evaluator of the runs to which models are fitted.
         place: index of the parameter.
     """
     parameter = evaluator.parameters[place]
+    coefficient = None
     if evaluator.kind.has_model:
         coefficient = _get_coefficient(evaluator.kind, parameter.name)
-        if coefficient is not None:
-            lower_limit, upper_limit = coefficient.least, coefficient.most
-            return (
-                -np.inf if lower_limit is None else lower_limit,
-                MAX_RANGE_FACTOR_MODEL_FILE * coefficient.plausible[0][1]
-                if upper_limit is None
-                else upper_limit,
-            )
-    return _get_physical_limits(parameter)
+    if coefficient is None:
+        return _get_physical_limits(parameter)
+    lower_limit, upper_limit = coefficient.least, coefficient.most
+    if lower_limit is None:
+        lower_limit = -np.inf
+    if upper_limit is None:
+        _, plausible_maximum = coefficient.plausible[0]
+        upper_limit = MAX_RANGE_FACTOR_MODEL_FILE * plausible_maximum
+    return lower_limit, upper_limit
 
 
 def _get_coefficient(kind: Any, name: str) -> Any:
@@ -297,22 +304,24 @@ def _get_physical_limits(parameter: Parameter) -> Bounds:
 
 
 def widen_range(parameter: Parameter, limits: Bounds) -> Bounds:
-    """Return the next wider range of a parameter, which is at most as wide as its limits.
+    """Return the next wider range of a parameter, within its physical limits.
 
-    The sign of the range is kept: only a range with negative values grows below zero.
+    A nonnegative range stays nonnegative: its positive ends are multiplied and divided by a factor,
+    and a lower end of zero stays. A range with negative values grows on both sides by a multiple of
+    its width. A range that exceeds the limits already does not become narrower.
 
     Args:
         parameter: the parameter with its present range.
         limits: its physical limits.
     """
     low, high = parameter.bounds
-    width = high - low
-    # A positive parameter stays positive, so its range grows by a factor on both sides.
-    lower = (
-        low / WIDENING_FACTOR if low > 0.0 else low - (WIDENING_FACTOR - 1.0) * width * (low < 0.0)
-    )
-    upper = high * WIDENING_FACTOR if low >= 0.0 else high + (WIDENING_FACTOR - 1.0) * width
-    return max(lower, min(limits[0], low)), min(upper, max(limits[1], high))
+    if low >= 0.0:
+        lower, upper = low / WIDENING_FACTOR, high * WIDENING_FACTOR
+    else:
+        growth = (WIDENING_FACTOR - 1.0) * (high - low)
+        lower, upper = low - growth, high + growth
+    lower_limit, upper_limit = limits
+    return max(lower, min(lower_limit, low)), min(upper, max(upper_limit, high))
 
 
 def describe_unusual_values(

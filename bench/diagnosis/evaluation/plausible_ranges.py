@@ -25,9 +25,12 @@ FREQUENCY_RANGE_RATIO = 100.0
 def adapt_to_time_scale(parameter: Parameter, longest: float, spacing: float) -> Parameter:
     """Return a coefficient with a plausible range that fits the time scale of a recording.
 
-    The range of an effect is for typical recordings of seconds. A slow recording can show longer
-    delays and decays, and one with few samples shows only low frequencies. Coefficients without a
-    time in their unit are returned as they are.
+    The range that an effect states is for typical recordings of seconds.
+
+    * Decay times (in s, always positive) and delays (in s, of either sign or zero) may be longer if
+      the runs are longer.
+    * Frequencies are at most half the sampling rate.
+    * Event times, and coefficients of other units, are returned as they are.
 
     Args:
         parameter: coefficient, with the range that its effect states.
@@ -49,6 +52,7 @@ def adapt_to_time_scale(parameter: Parameter, longest: float, spacing: float) ->
         low = min(low, high / FREQUENCY_RANGE_RATIO)
     if (low, high) == parameter.bounds:
         return parameter
+    # The nominal value must lie in the new range, and a range for training is dropped.
     nominal = min(max(parameter.nominal, low), high)
     return replace(parameter, nominal=nominal, bounds=(low, high), training=None)
 

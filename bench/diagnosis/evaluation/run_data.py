@@ -100,8 +100,10 @@ def prepare_run(
 def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, float]:
     """Return a guess of each initial state by name, from which fits start.
 
-    In order of preference it is the stated value, the value of a recorded rate, an estimate from
-    the first samples of a coordinate, or the default of the simulator.
+    In order of preference it is the stated value, an estimate from the first samples of the
+    recorded coordinate or rate, or the default of the simulator. A ball whose height is not
+    recorded starts so high that it does not land. The states of a robot's kinematic loops are made
+    consistent.
 
     Args:
         run: recorded run: times, channels and inputs.
@@ -130,7 +132,7 @@ def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, flo
 def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:
     """Return a start height in metres from which the ball does not land during the run.
 
-    If the height is not recorded, impacts cannot be identified.
+    It is used if the height is not recorded, because impacts can then not be identified.
 
     Args:
         run: the run; its constant ``gravity`` (m/s²) replaces that of the simulator.
@@ -144,12 +146,12 @@ def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:
 
 
 def _find_unobserved_states(simulator: SystemSimulator) -> set[str]:
-    """Return the states of coordinates that no recorded channel shows.
+    """Return the states (coordinate and rate) of coordinates that no recorded channel shows.
 
     They keep their defaults, because the data cannot determine them.
 
     Args:
-        simulator: Simulator with the recorded channels.
+        simulator: simulator with the recorded channels.
     """
     system, recorded_channels = simulator.system, {c.name for c in simulator.channels}
     unobserved_states = set()
@@ -179,8 +181,8 @@ def take_first_samples(scenario: Scenario, samples: int) -> Scenario:
 def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float, float]:
     """Estimate value and slope at the first time from a parabola through the first samples.
 
-    They are guesses of the initial position and velocity, from which fits start. With few samples a
-    line is used, and with fewer the first value and slope zero.
+    They are guesses of the initial position and velocity, from which fits start. With 3 or 4
+    samples a line is used; with 1 or 2, the first value and slope zero; with none, zero.
 
     Args:
         times: (T,) times, s.
@@ -199,6 +201,6 @@ def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float
     # Scaling time to [0, 1] keeps its powers well conditioned at any sample rate.
     scale = float(t[-1]) or 1.0
     degree = 1 if t.size < MIN_SAMPLES_FOR_PARABOLA else 2
-    coefficients = np.polynomial.polynomial.polyfit(t / scale, y, degree)
-    value, slope = coefficients[:2]
+    # Coefficients of ascending powers.
+    value, slope, *_ = np.polynomial.polynomial.polyfit(t / scale, y, degree)
     return float(value), float(slope / scale)

@@ -322,8 +322,9 @@ class RunEvaluator:
     def _find_delaying_coefficients(self) -> tuple[Indices, Indices]:
         """Return the indices of coefficients that shift sample times or need fine steps.
 
-        All elements of one engine call have the same time steps, so elements with such coefficients
-        are simulated separately.
+        A delay shifts sample times. Filters of sensors and effects with a sharp transition
+        (`Effect.sharp`) need fine steps. All elements of one engine call have the same time steps,
+        so elements with such coefficients are simulated separately.
 
         Returns:
             The indices in theta of coefficients that shift sample times, and of those that need
@@ -367,8 +368,8 @@ class RunEvaluator:
 
     def get_coefficient_indices(self, effect: str) -> range:
         """Return the indices in theta of the coefficients of an effect."""
-        slot = self.coefficient_slices[effect]
-        return range(slot.start, slot.stop)
+        coefficient_slice = self.coefficient_slices[effect]
+        return range(coefficient_slice.start, coefficient_slice.stop)
 
     def get_nominal_theta(self) -> Array:
         """Return the parameters (P,) at their nominal values, with all effects off."""
@@ -397,7 +398,7 @@ class RunEvaluator:
         Results of a robot are cached, because the search simulates some points repeatedly. The
         correction of the discretisation error is added, if there is one.
 
-        Shapes: T samples, C channels, P parameters, s states of a run.
+        Shapes: L batch elements, T samples, C channels, P parameters, s states of a run.
 
         Args:
             theta: (L, P) parameters.
@@ -412,6 +413,7 @@ class RunEvaluator:
         if self.has_linearisation:
             simulated = np.empty((len(theta), *self.observed.shape[1:]))
             elements = zip(theta, runs.tolist(), states, strict=True)
+            # All that the result depends on.
             keys = [
                 b"".join(
                     (repr((share, run)).encode(), element_theta.tobytes(), initial_state.tobytes())
@@ -484,13 +486,14 @@ class RunEvaluator:
                 max_batch_size, max(MIN_CHUNK_SIZE, int(MAX_CHUNK_SAMPLES / (share * length)))
             )
         element_indices, calls = [], []
-        for is_fine, part in self._split_into_calls(theta, max_batch_size):
-            element_indices.append(part)
-            calls.append((is_fine, theta[part], runs[part], states[part], share))
+        for is_fine, elements in self._split_into_calls(theta, max_batch_size):
+            element_indices.append(elements)
+            calls.append((is_fine, theta[elements], runs[elements], states[elements], share))
         for number, simulated in self.worker_pool.map_unordered(
             self, RunEvaluator._simulate_runs, calls
         ):
             sample_count = simulated.shape[1]
+            # A single complete result need not be copied.
             if len(calls) == 1 and sample_count == length:
                 return simulated
             simulated_runs[element_indices[number], :sample_count] = simulated
@@ -500,15 +503,15 @@ class RunEvaluator:
     def with_runs(self, runs: Sequence[Run]) -> RunEvaluator:
         """Return a `RunEvaluator` of other runs that were cut or thinned from these runs.
 
-        It shares the parameters, the grids of shape parameters, the search control and the worker
-        pool.
+        It shares the parameters, the search control and the worker pool, and the durations and
+        ranges from which the values of shape parameters, such as frequencies, are chosen.
         """
         evaluator = self._copy(self.kind, runs)
         # Periodic effects continue from segment to segment, and a value found in one segment holds
         # in all of them.
         evaluator.longest_duration = self.longest_duration
         evaluator.time_span = self.time_span
-        # Ranges are computed now, because those of segments would differ.
+        # Ranges of the channels are those of these runs, because those of segments would differ.
         for name in self.channels:
             self._get_channel_range(name)
         evaluator._channel_ranges = self._channel_ranges
@@ -565,8 +568,8 @@ class RunEvaluator:
     def group_compatible(self, theta: Array) -> Indices:
         """Return group numbers (L,); batch elements of one group can share an engine call.
 
-        Groups 1 and 3 have effects that read signals at other times; groups 2 and 3 need fine
-        steps.
+        Elements of one call have the same time steps. Groups 1 and 3 have effects that read signals
+        at other times, such as delays; groups 2 and 3 have effects that need fine steps.
 
         Shapes: P parameters.
 
@@ -614,7 +617,14 @@ class RunEvaluator:
     def _call_engine(
         self, is_fine: bool, theta: Array, scenarios: Sequence[Scenario], states: Array
     ) -> Array:
-        """Simulate L batch elements with one time step; arguments as those of `_simulate_runs`."""
+        """Simulate L batch elements in one engine call.
+
+        Args:
+            is_fine: whether to use the fine time step that filters need.
+            theta: (L, P) parameters of the system, freed constants, and coefficients of effects.
+            scenarios: (L,) input of each element.
+            states: (L, s) initial states.
+        """
         simulator = self._fine_step_simulator if is_fine else self.simulator
         # A freed constant is fitted like a parameter, but passed to the simulator as a constant.
         freed_indices = np.arange(self.system_parameter_count, self.base_indices.size)
@@ -629,6 +639,8 @@ class RunEvaluator:
     ) -> Iterator[tuple[bool, Indices]]:
         """Yield for each engine call whether it needs fine steps, and its batch elements.
 
+        Elements are in one call only if they need the same time steps (`group_compatible`).
+
         Args:
             theta: (L, P) parameters of the batch elements.
             max_batch_size: maximum number of elements of a call.
@@ -636,8 +648,11 @@ class RunEvaluator:
         groups = self.group_compatible(theta)
         for group in np.unique(groups):
             elements = np.flatnonzero(groups == group)
-            for part in np.array_split(elements, -(-elements.size // max_batch_size)):
-                yield bool(group >= 2), part
+            # The quotient is rounded up.
+            call_count = -(-elements.size // max_batch_size)
+            # Groups 2 and 3 need fine steps.
+            for call_elements in np.array_split(elements, call_count):
+                yield bool(group >= 2), call_elements
 
     def simulate_scenarios(
         self, theta: Array, scenarios: Sequence[Scenario], states: Array
@@ -661,11 +676,11 @@ class RunEvaluator:
         length = max(scenario.times.size for scenario in scenarios)
         simulated = np.full((len(theta), length, len(self.channels)), np.nan)
         max_batch_size = max(MIN_CHUNK_SIZE, MAX_BATCH_SAMPLES // length)
-        for is_fine, part in self._split_into_calls(theta, max_batch_size):
+        for is_fine, elements in self._split_into_calls(theta, max_batch_size):
             observations = self._call_engine(
-                is_fine, theta[part], [scenarios[i] for i in part], states[part]
+                is_fine, theta[elements], [scenarios[i] for i in elements], states[elements]
             )
-            simulated[part, : observations.shape[1]] = observations
+            simulated[elements, : observations.shape[1]] = observations
         return simulated
 
     def _set_freed_constants(self, scenario: Scenario, theta: Array) -> Scenario:
@@ -712,7 +727,7 @@ class RunEvaluator:
         """Use the results of a state filter for the runs of a robot.
 
         The filter provides guesses, derivatives and prior standard deviations of the initial
-        states.
+        states. Known initial states keep their values, and all do if the filter diverged.
 
         Args:
             filtered_runs: filtered runs, a
@@ -728,7 +743,9 @@ class RunEvaluator:
         self.state_prior = filtered_runs.get_state_prior()
 
     def begin_at(self, states: Array, deviations: Array) -> None:
-        """Use estimated initial states.
+        """Use estimated initial states of a robot in contact, from a nonlinear filter.
+
+        Known initial states keep their values. From now on, simulated runs are not linearised.
 
         Shapes: R runs, s states of a run.
 

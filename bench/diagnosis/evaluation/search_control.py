@@ -303,6 +303,7 @@ class SearchControl:
         Args:
             held_out: whether there are held-out runs.
         """
+        # The present question and all later ones.
         names = list(QUESTION_TEXTS)
         skipped_questions = names[names.index(self._question) :]
         if not held_out:
@@ -312,16 +313,19 @@ class SearchControl:
         )
 
     def _report_progress(self, share: float) -> None:
-        """Report the finished share of the search.
+        """Estimate and report the finished share of the search.
+
+        A question has an unknown number of steps, each of which is assumed to take the same share
+        of what remains of the question. The weight of a question is its usual duration.
 
         Args:
-            share: finished share of the present fit, 0 to 1.
+            share: finished share of the present step, 0 to 1.
         """
-        remaining = (1.0 - PROGRESS_STEP_SHARE) ** self._finished_steps
-        # Earlier steps have taken their shares; the fit is a part of the present step.
-        finished_share = 1.0 - remaining * (1.0 - PROGRESS_STEP_SHARE * share)
-        total = self._finished_weight + self._current_weight + self._later_weight
-        total_share = (self._finished_weight + self._current_weight * finished_share) / total
+        remaining_share = (1.0 - PROGRESS_STEP_SHARE) ** self._finished_steps
+        finished_share = 1.0 - remaining_share * (1.0 - PROGRESS_STEP_SHARE * share)
+        total_weight = self._finished_weight + self._current_weight + self._later_weight
+        finished_weight = self._finished_weight + self._current_weight * finished_share
+        total_share = finished_weight / total_weight
         self._listener.completed(total_share)
         if self._progress is not None:
             self._progress(total_share, self._step_text)

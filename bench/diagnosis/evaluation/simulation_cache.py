@@ -24,30 +24,34 @@ class SimulationCache:
 
     def missing(self, keys: Sequence[bytes]) -> list[int]:
         """Return the indices of elements that are not cached; of equal ones only the first."""
-        first = {key: place for place, key in reversed(list(enumerate(keys)))}
-        return sorted(place for key, place in first.items() if key not in self._held)
+        # In reversed order, the first of equal elements is the one that stays.
+        first_indices = {key: index for index, key in reversed(list(enumerate(keys)))}
+        return sorted(index for key, index in first_indices.items() if key not in self._held)
 
     def fill(
-        self, keys: Sequence[bytes], places: Sequence[int], results: Array, out: Array
+        self, keys: Sequence[bytes], missing_indices: Sequence[int], results: Array, out: Array
     ) -> None:
         """Store new results, and write those of all elements, new and cached, to an output array.
 
-        The oldest results are removed if the memory limit is exceeded.
+        The oldest results are removed if the memory limit `CACHE_BYTES` is exceeded.
 
         Shapes: T samples, C channels.
 
         Args:
             keys: keys of all elements, as passed to `missing`.
-            places: indices of the elements that `missing` returned.
+            missing_indices: indices of the elements that `missing` returned.
             results: (N, T, C) results of these elements.
             out: (L, T, C) output array for the results of all elements.
         """
-        new_results = {keys[place]: row for place, row in zip(places, results, strict=True)}
-        for place, key in enumerate(keys):
-            out[place] = new_results[key] if key in new_results else self._held[key]
-        for key, row in new_results.items():
+        new_results = {
+            keys[index]: result for index, result in zip(missing_indices, results, strict=True)
+        }
+        for index, key in enumerate(keys):
+            out[index] = new_results[key] if key in new_results else self._held[key]
+        for key, result in new_results.items():
             # Store a copy: a view would keep the results of a whole call in memory.
-            self._held[key] = row.copy()
-            self._bytes += row.nbytes
+            self._held[key] = result.copy()
+            self._bytes += result.nbytes
+        # The oldest entry of a dictionary comes first.
         while self._bytes > CACHE_BYTES:
             self._bytes -= self._held.pop(next(iter(self._held))).nbytes

@@ -66,8 +66,8 @@ def rank_option_alternatives(
 ) -> list[OptionAlternative]:
     """Simulate the runs with alternative solver options, and rank those that explain them better.
 
-    1. Compute the sum of squares that an alternative must not exceed. Another value of an option
-       that has been changed already needs no large decrease.
+    1. Compute the sum of squares that an alternative must not exceed. It is lower for a further
+       option than for another value of the options that have been changed already.
     2. Simulate all alternatives.
     3. Leave out those that make the same motion as a better one.
 
@@ -94,11 +94,11 @@ def rank_option_alternatives(
     observed = np.where(is_recorded, evaluator.observed, 0.0) / noise.sigma
     samples = max(int(is_recorded.sum()), 1)
     # 1. Limits.
-    present = float(np.square(simulate(kind.numerics) - observed).sum())
-    limit = present - MIN_SQUARES_DECREASE
-    limit_of_other_option = limit
-    if present > MIN_CLEAR_MEAN_SQUARE * samples:
-        limit_of_other_option = samples + MAX_EXCESS_RATIO * (present - samples)
+    present_squares = float(np.square(simulate(kind.numerics) - observed).sum())
+    limit = present_squares - MIN_SQUARES_DECREASE
+    limit_of_further_option = limit
+    if present_squares > MIN_CLEAR_MEAN_SQUARE * samples:
+        limit_of_further_option = samples + MAX_EXCESS_RATIO * (present_squares - samples)
     changed_options = list_changed_options(kind.robot, kind.numerics).keys()
     # 2. Simulations.
     ranked: list[tuple[OptionAlternative, Array]] = []
@@ -107,9 +107,9 @@ def rank_option_alternatives(
         motion = simulate(numerics)
         squares = float(np.square(motion - observed).sum())
         options = list_changed_options(kind.robot, numerics).keys()
-        if squares < (limit if options == changed_options else limit_of_other_option):
+        if squares < (limit if options == changed_options else limit_of_further_option):
             ranked.append((OptionAlternative(numerics, squares), motion))
-    # 3. Distinct motions.
+    # 3. Distinct motions, the best one first.
     ranked.sort(key=lambda pair: pair[0].squares)
     distinct: list[tuple[OptionAlternative, Array]] = []
     for alternative, motion in ranked:
@@ -122,13 +122,14 @@ def rank_option_alternatives(
 def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSettings]:
     """Yield solver settings that differ from the present ones in one option.
 
-    The solver and its iterations count as one option. Values that are closer to common settings
-    come first.
+    The solver and its number of iterations count as one option; many iterations, which are more
+    common, come first.
 
     Args:
-        kind: Simulator class of the robot.
+        kind: simulator class of the robot.
     """
     settings = kind.numerics
+    # Present value of each option: changed already, or that of the model file.
     present = settings.to_model_options()
     for name in ("cone", "impratio", "noslip_iterations", "solver", "iterations"):
         present.setdefault(name, read_option(kind.robot, name))
@@ -144,7 +145,7 @@ def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSett
                 yield settings.replace_options({name: number})
     for solver in (present["solver"], *SOLVER_IDS.values()):
         for iterations in (present["iterations"], *SOLVER_ITERATIONS[::-1]):
-            changed = {"solver": solver, "iterations": iterations}
-            options = {name: n for name, n in changed.items() if n != present[name]}
-            if options:
-                yield settings.replace_options(options)
+            pair = {"solver": solver, "iterations": iterations}
+            changed = {name: number for name, number in pair.items() if number != present[name]}
+            if changed:
+                yield settings.replace_options(changed)

@@ -60,9 +60,12 @@ def draw_surrogates(
 ) -> Array:
     """Draw residuals (count, R, T, C) with the spectrum of a given residual.
 
-    They contain no effect, so their scores show which scores noise alone reaches. Each channel is
-    an autoregression with the innovations of the residual in random order. A fit makes noise look
-    less correlated; this bias is estimated from a first set of surrogates (pilots) and corrected.
+    They contain no effect, so their scores show which scores noise alone reaches.
+
+    1. Fit an autoregression to each channel.
+    2. A fit of a model has made the noise look less correlated. Estimate this bias from a first set
+       of surrogates (pilots), and correct the autoregressions.
+    3. Simulate them with innovations that are drawn at random from those of the residual.
 
     Shapes: R runs, T samples, C channels.
 
@@ -75,10 +78,11 @@ def draw_surrogates(
             it the bias is not corrected.
     """
     channels = residual.shape[2]
+    # 1. Autoregressions.
     weights = [
         _fit_autoregression(residual[..., c], observed_mask[..., c]) for c in range(channels)
     ]
-    # White noise has no correlation that a fit could reduce.
+    # 2. Bias. White noise has no correlation that a fit could reduce.
     if project_out is not None and any(w.size for w in weights):
         pilot_count = int(
             np.clip(PILOT_SAMPLE_COUNT // max(int(observed_mask.sum()), 1), *PILOT_COUNT_RANGE)
@@ -88,6 +92,7 @@ def draw_surrogates(
         )
         for c in range(channels):
             weights[c] = _correct_bias(weights[c], projected_pilots[..., c], observed_mask[..., c])
+    # 3. Simulation.
     return _simulate_autoregression(residual, observed_mask, weights, count, rng)
 
 
@@ -98,9 +103,10 @@ def _simulate_autoregression(
     count: int,
     rng: np.random.Generator,
 ) -> Array:
-    """Simulate autoregressions, eq. (1), with resampled innovations of a residual.
+    """Simulate autoregressions with innovations that are drawn from those of a residual.
 
-    The process is e_t = sum_k a_k e_{t-k} + u_t (1), with weights a_k and innovations u_t.
+    The process is e_t = sum_k a_k e_{t-k} + u_t, eq. (1) of the module docstring, with weights a_k
+    and independent innovations u_t. Series are simulated in chunks that fit in the CPU cache.
 
     Shapes: R runs, T samples, C channels.
 
@@ -139,14 +145,14 @@ def _simulate_autoregression(
 def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) -> Array:
     """Correct weights (p,) for the bias of a fit, by eq. (2) of the module docstring.
 
-    With the weights a* estimated from surrogates of a, the corrected weights are a + s (a - a*)
-    (2), where s <= 1 keeps the process stationary.
+    The surrogates have the weights a, and a fit to them gives the weights a*. The corrected weights
+    are a + s (a - a*), where s is the largest share of 1 for which the process is stationary.
 
     Shapes: R runs, T samples.
 
     Args:
         weights: (p,) weights of an autoregression.
-        projected_pilots: (count, R, T) residuals of the fit to noise with these weights.
+        projected_pilots: (count, R, T) surrogates with these weights, after a fit of the model.
         observed_mask: (R, T) mask of available samples.
     """
     order = weights.size
@@ -200,7 +206,8 @@ def _fit_autoregression(values: Array, observed_mask: Mask) -> Array:
         observed_mask: (R, T) whether a sample is recorded.
 
     Returns:
-        Weights a_k (p,) of eq. (1); empty if fewer than `MIN_INNOVATIONS` innovations are complete.
+        Weights a_k (p,); empty, for white noise, if fewer than `MIN_INNOVATIONS` innovations can be
+        computed.
     """
     filled = np.where(observed_mask, values, 0.0)
     covariances = _estimate_autocovariances(
@@ -217,9 +224,10 @@ def _fit_autoregression(values: Array, observed_mask: Mask) -> Array:
 def _compute_centred_innovations(filled: Array, observed_mask: Mask, weights: Array) -> Array:
     """Return the innovations (n,) minus their mean; the samples themselves if there are too few.
 
-    Shapes: R runs, T samples.
+    The innovations are the u_t of the process e_t = sum_k a_k e_{t-k} + u_t. Without any sample, a
+    single zero is returned.
 
-    The process is e_t = sum_k a_k e_{t-k} + u_t (1).
+    Shapes: R runs, T samples.
 
     Args:
         filled: (R, T) residual of one channel, zero where it is not recorded.
@@ -260,6 +268,9 @@ def _estimate_autocovariances(filled: Array, observed_mask: Mask, max_order: int
 def _select_order_by_aic(covariances: Array, count: int) -> Array:
     """Return weights (p,) of the order p with the lowest n log var u + 2 p (H. Akaike, 1974).
 
+    var u is the variance of the innovations of an autoregression of order p, and n the number of
+    samples.
+
     Args:
         covariances: (q + 1,) autocovariances at lags 0 to q, the maximum order.
         count: number n of recorded samples.
@@ -276,11 +287,10 @@ def _select_order_by_aic(covariances: Array, count: int) -> Array:
 
 
 def _compute_innovations(filled: Array, observed_mask: Mask, weights: Array) -> Array:
-    """Return the innovations u_t (n,) of eq. (1): samples minus their prediction from earlier ones.
+    """Return the innovations u_t (n,) of an autoregression: samples minus their prediction.
 
-    Times at which one of the required samples is missing are left out.
-
-    The innovations are u_t = e_t - sum_k a_k e_{t-k}, from (1).
+    They are u_t = e_t - sum_k a_k e_{t-k}, by eq. (1) of the module docstring. Times at which one
+    of these samples is missing are left out.
 
     Shapes: R runs, T samples.
 
@@ -291,7 +301,7 @@ def _compute_innovations(filled: Array, observed_mask: Mask, weights: Array) -> 
     """
     order, length = weights.size, observed_mask.shape[1]
     predicted = np.zeros(1)
-    # A sample and all samples that predict it.
+    # Whether a sample and all samples that predict it are recorded.
     is_complete = observed_mask[:, order:]
     for k, weight in enumerate(weights, start=1):
         lagged_samples = slice(order - k, length - k)

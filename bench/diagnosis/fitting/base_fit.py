@@ -167,10 +167,10 @@ def fit_base_model(
         best = min(fits, key=lambda fit: fit.cost)
         if best.cost > max_cost and horizon.share < 1.0:
             return BaseFit(best, frozenset())
-    # 3. Own derivatives.
+    # 3. Derivatives at the fitted model.
     if evaluator.has_linearisation and evaluator.filtered_runs is None:
-        # Derivatives about the first start are replaced by those about the fitted model for all
-        # later fits. The import is local, because only robots need it.
+        # They are those by initial states, which all later fits share. Without a filter, they were
+        # computed about the first start. The import is local, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
         compute_state_jacobian(evaluator, best.theta, best.initial_states, is_recomputed=True)
@@ -303,8 +303,9 @@ def _is_sensitive(
 ) -> bool:
     """Return whether the simulated runs depend on a parameter enough to estimate it.
 
-    The criterion is the norm of the change of all samples, in units of the noise, if the parameter
-    moves over its whole range.
+    The norm of the change of all samples, in units of the noise, must exceed
+    `MIN_SENSITIVITY_SIGMAS` if the parameter moves over its whole range. It is computed from the
+    derivatives at the fit.
 
     Args:
         evaluator: evaluator with the recorded runs.
@@ -312,15 +313,14 @@ def _is_sensitive(
         index: index of the parameter in theta.
         noise: noise of each channel.
     """
-    # A fixed parameter has no column.
+    # A fixed parameter has no column in the Jacobian (R, T, C, q + s).
     columns = np.flatnonzero(fit.free_indices == index)
     if not columns.size:
         return False
     low, high = evaluator.parameters[index].bounds
     change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
-    # Count only available samples.
-    available_change = change[np.isfinite(evaluator.observed)]
-    change_norm = np.sqrt(np.square(available_change).sum())
+    recorded_change = change[np.isfinite(evaluator.observed)]
+    change_norm = np.sqrt(np.square(recorded_change).sum())
     return float(change_norm) > MIN_SENSITIVITY_SIGMAS
 
 
@@ -349,7 +349,7 @@ def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> Base
     """Widen the ranges of parameters that are at a bound, and fit the base model again.
 
     A declared range is a guess. If the best value lies outside it, an effect would be fitted to the
-    difference. Return the base model unchanged if no parameter is at a bound.
+    difference. This is repeated until no parameter is at a bound that physics allows to exceed.
 
     Args:
         evaluator: the runs for fitting; the ranges of its parameters are replaced.
@@ -357,7 +357,7 @@ def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> Base
         base: fit of the base model, with the parameters that were fixed or freed.
 
     Returns:
-        The base model; the same if no parameter is at a bound.
+        The base model; the same if no range was widened.
     """
     for _ in range(MAX_WIDENING_ROUNDS):
         wider_bounds = _list_wider_bounds(evaluator, base)
@@ -418,16 +418,16 @@ def _evaluate_base(
     The loss is the root mean square of the residuals in units of the noise, as in a comparison of
     tuners; it is infinite if the simulation fails.
 
-    Shapes: T samples, C channels.
+    Shapes: R runs, padded to T samples, C channels.
 
     Args:
         evaluator: evaluator that simulates the recorded runs.
         noise: noise of each channel.
-        observed: (T, C) observations of all runs, concatenated.
+        observed: (R T, C) observations of all runs, concatenated.
         base: (n, b) sets of base parameters.
 
     Returns:
-        Observations (n, T, C) and losses (n,).
+        Simulated observations (n, R T, C) and losses (n,).
     """
     # No effect is active, because the coefficients after the base parameters are zero.
     theta = np.tile(evaluator.get_nominal_theta(), (len(base), 1))

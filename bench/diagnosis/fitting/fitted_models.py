@@ -139,7 +139,8 @@ class ModelSet:
     def _store_if_better(self, model: FittedModel) -> FittedModel:
         """Store a model unless a better one with the same effects is stored; return the better one.
 
-        The better one has the higher penalised log-likelihood.
+        The better one has the higher penalised log-likelihood. If a model is replaced, what was
+        computed about it is discarded (`on_replaced`).
         """
         # The key does not depend on the order in which effects were added.
         key = frozenset(model.effects)
@@ -154,9 +155,9 @@ class ModelSet:
     def _rate_fit(self, fit: TrajectoryFit) -> FittedModel:
         """Return a fit with its likelihood and its penalised log-likelihood, eq. (1).
 
-        The merit is M = 2 log L - k log n - sum_e max(c_e - k_e log n, 0) (1), with the likelihood
-        L, k parameters, n samples, and for each effect e its k_e coefficients and the gain c_e of
-        its best shape under the null hypothesis.
+        It is M = 2 log L - k log n - sum_e max(c_e - k_e log n, 0), with the likelihood L, k fitted
+        parameters and determined initial states, n samples, and for each effect e its k_e
+        coefficients and the gain c_e of its best shape from noise alone.
         """
         freedom = fit.free_indices.size + count_identified_states(self.evaluator, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
@@ -204,18 +205,15 @@ class ModelSet:
         return float(np.log(max(count, MIN_EFFECTIVE_SAMPLES)))
 
     def get_effect_penalty(self, name: str) -> float:
-        """Return the part of the last term of eq. (1), the merit, that belongs to an effect.
+        """Return the part of the penalty in the penalised log-likelihood that belongs to an effect.
 
-        An effect with many shapes gains likelihood from noise alone. The part of this gain that the
-        penalty of its coefficients does not cover is subtracted.
-
-        It is the term max(c_e - k_e log n, 0) of (1), with k_e coefficients and the gain c_e that
-        the best shape has under the null hypothesis.
+        An effect with many shapes, such as frequencies, gains likelihood from noise alone. The part
+        of this gain that the penalty log n of each of its coefficients does not cover is
+        subtracted: max(c_e - k_e log n, 0) of eq. (1), with k_e coefficients, n samples and the
+        gain c_e of the best shape under the null hypothesis. It is zero if there are few shapes.
         """
-        coefficients = self.evaluator.coefficient_slices[name]
-        # If there are few shapes, the coefficients alone pay for the gain under the null
-        # hypothesis.
-        parameter_penalties = (coefficients.stop - coefficients.start) * self.parameter_penalty
+        coefficient_count = len(self.evaluator.get_coefficient_indices(name))
+        parameter_penalties = coefficient_count * self.parameter_penalty
         return float(max(self.null_gains.get(name, 0.0) - parameter_penalties, 0.0))
 
     def refit_models(
@@ -286,9 +284,10 @@ class ModelSet:
         return self.fit_all([start], iterations)[0]
 
     def _report_best(self) -> None:
-        """Report the effects of the best model, and how much they explain, to the display.
+        """Report the effects of the best model, and how much they explain, to the progress display.
 
-        The share is the part of the base model's excess over the noise that they remove.
+        The share is the part of the base model's excess over the noise that they remove. Nothing is
+        reported if the base model is not fitted or the best one.
         """
         base = self.models.get(frozenset())
         best = max(
@@ -307,8 +306,10 @@ class ModelSet:
         This is needed if the fit ended with derivatives from a nearby point, for example for
         confidence intervals. A fit with zero iterations computes them.
         """
+        # A model that could not be simulated has no derivatives.
         if model.fit.is_own_jacobian or not np.isfinite(model.fit.cost):
             return model
+        # The stored model may be the same fit, whose derivatives were computed earlier.
         stored_model = self.models.get(frozenset(model.effects))
         if (
             stored_model is not None
@@ -375,10 +376,10 @@ class ModelSet:
     def _select_promising_starts(
         self, starts: Sequence[FitStart], noise: NoiseModel
     ) -> list[FitStart]:
-        """Fit the first part of the runs, and return the starts of the models that fit it best.
+        """Fit the first part of the runs, and return starts from the models that fit it best.
 
-        Each fit horizon is a longer part of the runs, with fewer models; the last horizon, whole
-        runs, is left to the caller.
+        This is repeated with a longer part of the runs (a fit horizon) and fewer models. The last
+        horizon, whole runs, is left to the caller.
 
         Args:
             starts: starts of all fits.

@@ -274,14 +274,18 @@ class FitState:
         return self.has_unreliable_states or (is_slow and not self._is_far(self.point.cost))
 
     def _ask_for_own_states(self) -> bool:
-        """Ask for derivatives by initial states of its own if the shared ones may be wrong.
+        """Mark the derivatives by initial states as unreliable if the shared ones may be wrong.
 
-        Where a joint sticks, it keeps an error of its initial position, which the derivatives that
-        all models share let decay. A model that leaves only noise has no such error, and one that
-        is very far from the data has larger ones.
+        Then the fit gets its own before the next step. Where a joint sticks, it keeps an error of
+        its initial position, but the derivatives that all models share let this error decay. They
+        may be wrong if
+
+        * the model has dry friction, so that joints may stick;
+        * the residual is neither pure noise nor very large, so that this error may be the cause;
+        * the fit has improved since its own derivatives were computed.
 
         Returns:
-            Whether the derivatives are recomputed before the next step.
+            Whether the derivatives were marked.
         """
         low, high = UNRELIABLE_MEAN_SQUARES
         is_unreliable = low < self.point.cost / max(self.sample_count, 1) < high
@@ -299,15 +303,13 @@ class FitState:
         """Return the decrease of the cost by a step below which the fit has converged.
 
         It has an absolute part in units of the noise variance, and a share of the `cost` (the sum
-        of squares), which is larger if the model is far from the data.
-        A fit whose parameters are reported has only a smaller absolute part.
+        of squares), which is larger if the model is far from the data. A fit whose parameters are
+        reported has only a smaller absolute part.
         """
         if self.is_final_fit:
             return ROUGH_FINAL_TOLERANCE if self.has_rough_cost else FINAL_CONVERGENCE_TOLERANCE
-        return (
-            CONVERGENCE_TOLERANCE
-            + (COARSE_SHARE if self._is_far(cost) else RELATIVE_CONVERGENCE_TOLERANCE) * cost
-        )
+        cost_share = COARSE_SHARE if self._is_far(cost) else RELATIVE_CONVERGENCE_TOLERANCE
+        return CONVERGENCE_TOLERANCE + cost_share * cost
 
     def _is_far(self, cost: float) -> bool:
         """Return whether a fit is far from the data and has a rough cost (only robots do).
@@ -337,9 +339,9 @@ class FitState:
         )
 
     def compute_inward_steps(self, theta: Array) -> Array:
-        """Return signed difference steps (q + s,) from parameters (P,).
+        """Return signed finite-difference steps (q + s,), which stay within the bounds.
 
-        The step of a parameter at its upper bound points inward.
+        Steps are positive, except that of a parameter at its upper bound, which points inward.
 
         Shapes: P parameters, q fitted parameters, s states of a run.
 
@@ -354,8 +356,9 @@ class FitState:
     def update_jacobian(self, new_point: FitPoint) -> Array:
         """Return the Jacobian (R, T, C, q + s) at a new point by Broyden's update.
 
-        For a step delta with scales D, J <- J + (y(x + delta) - y(x) - J delta) delta' D^-2 /
-        (delta' D^-2 delta), eq. (4) of the module docstring. Each run is updated separately.
+        For the simulation y, a step delta of the unknowns x and their scales D (the difference
+        steps), J <- J + (y(x + delta) - y(x) - J delta) delta' D^-2 / (delta' D^-2 delta), eq. (4)
+        of the module docstring. Each run is updated separately.
 
         Shapes: R runs, T samples, C channels, q fitted parameters.
 
@@ -367,6 +370,7 @@ class FitState:
         observed_change = np.nan_to_num(new_point.simulated - point.simulated)
         parameter_change = (new_point.start.theta - point.start.theta)[self.free_indices]
         state_changes = new_point.start.initial_states - point.start.initial_states
+        # Step of all unknowns of each run (R, q + s).
         displacement = np.concatenate(
             [
                 np.broadcast_to(parameter_change, (len(state_changes), parameter_change.size)),
@@ -416,9 +420,11 @@ class FitState:
         factor = max(MIN_DAMPING_FACTOR, 1.0 - (2.0 * gain_ratio - 1.0) ** 3)
         self.damping = max(self.damping * factor, MIN_DAMPING)  # (2)
         self.growth = INITIAL_DAMPING_GROWTH
+        # Far from the data, the fit hardly gains any more.
         is_stagnant = gain_ratio < STAGNANT_RATIO and decrease < STAGNANT_SHARE * cost
         if is_own_jacobian and not self.is_final_fit and is_stagnant and self._is_far(cost):
             self.is_finished = True
+        # The cost is too rough to predict at the scale of the remaining gain.
         is_predicted = abs(gain_ratio - 1.0) <= JACOBIAN_REUSE_TOLERANCE
         largest = max(decrease, self.predicted_decrease)
         if is_own_jacobian and not is_predicted and self._is_rough_at(largest):
@@ -428,12 +434,13 @@ class FitState:
             self.mark_converged()
 
     def reject_step(self) -> None:
-        """Increase the damping by eq. (3) after a step that did not decrease the cost.
+        """React to a step that did not decrease the cost.
 
-        If the derivatives belong to another point, they may have caused the bad step, so they are
-        recomputed first. A fit with a rough cost ends if it can hardly gain anything.
-
-        The damping becomes 2 nu lambda, and its growth factor 2 nu (3).
+        1. If the derivatives belong to another point, or those by initial states may be wrong, they
+           may have caused the bad step, so they are recomputed.
+        2. Otherwise a fit with a rough cost ends if it can hardly gain anything.
+        3. Otherwise the next step is shorter: the damping lambda becomes 2 nu lambda, and its
+           growth factor nu becomes 2 nu, eq. (3).
         """
         if not self.has_own_jacobian:
             self.is_jacobian_stale = True
@@ -449,13 +456,15 @@ class FitState:
     def find_blocked_parameters(self, residual: Array, jacobian: Array) -> Mask:
         """Return the mask (q,) of parameters at a bound that the data push against.
 
+        A step along the descent of the cost would move them beyond the bound.
+
         Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
         Args:
             residual: (R, T, C) whitened residual.
             jacobian: (R, T, C, q + s) whitened derivatives.
         """
-        # Direction of steepest descent of the cost.
+        # Direction of steepest descent of the cost, as the residual is observed minus simulated.
         descent = np.einsum("rtc,rtcq->q", residual, jacobian[..., : self.free_indices.size])
         values = self.point.start.theta[self.free_indices]
         is_blocked_below = (values <= self.low) & (descent < 0)

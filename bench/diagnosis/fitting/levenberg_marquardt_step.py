@@ -112,8 +112,8 @@ class _ArrowheadEquations:
             # zero.
             scale = np.sqrt(np.maximum(np.diagonal(self.shared)[is_free], MIN_DIAGONAL))
             scaled = free / np.outer(scale, scale)
+            # Derivatives of an unstable motion give no usable step.
             if not np.isfinite(scaled).all():
-                # Derivatives of an unstable motion give no usable step.
                 return np.full(len(right_hand_side), np.nan), np.full(self.pull.shape, np.nan)
             # Least squares takes the shortest step if parameters have the same response.
             solution = np.linalg.lstsq(scaled, right_hand_side[is_free] / scale, rcond=None)
@@ -126,7 +126,8 @@ class _ArrowheadEquations:
 def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, Array]:
     """Eliminate the initial states of every run from the normal equations.
 
-    The result is U - sum_i W_i V_i^-1 W_i' and a - sum_i W_i V_i^-1 b_i, both sides of (4).
+    The Schur complement U - sum_i W_i V_i^-1 W_i' is the matrix of eq. (4) of the module docstring,
+    the equations of the shared parameters alone.
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
@@ -136,18 +137,20 @@ def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple
         inner: (R, s, s) all V_i.
 
     Returns:
-        The matrix (q, q) of eq. (4), and all V_i⁻¹ W_iᵀ (R, s, q).
+        The Schur complement (q, q), and all V_i⁻¹ W_iᵀ (R, s, q).
     """
     transposed = cross.transpose(0, 2, 1)
-    solution = np.linalg.solve(inner, transposed)
-    inverse_cross = np.asarray(solution, dtype=np.float64)
+    inverse_cross = np.asarray(np.linalg.solve(inner, transposed), dtype=np.float64)
     products = np.matmul(cross, inverse_cross)
-    schur: Array = shared - products.sum(axis=0)  # (4), its left side
-    return schur, inverse_cross
+    schur_complement: Array = shared - products.sum(axis=0)
+    return schur_complement, inverse_cross
 
 
 def hold_known_states(inner: Array, cross: Array, known_mask: Mask) -> tuple[Array, Array]:
     """Fix known initial states in the normal equations.
+
+    The equation of a known state becomes: its step is zero. No parameter and no other state is
+    coupled to it.
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
@@ -157,9 +160,8 @@ def hold_known_states(inner: Array, cross: Array, known_mask: Mask) -> tuple[Arr
         known_mask: (R, s) mask of known initial states.
 
     Returns:
-        V_i and W_i, in which no parameter and no other state is coupled to a known state.
+        The changed V_i and W_i.
     """
-    # The equation of a known state becomes: its step is zero.
     is_coupled = known_mask[:, :, None] | known_mask[:, None, :]
     decoupled = np.where(is_coupled, np.eye(inner.shape[1]), inner)
     return decoupled, np.where(known_mask[:, None, :], 0.0, cross)
@@ -221,7 +223,9 @@ def _assemble_normal_equations(
     """Assemble the normal equations, eqs. (2) and (3), of all runs, without damping.
 
     They are U dx + sum_i W_i dz_i = a and W_i' dx + V_i dz_i = b_i, for the step dx of the
-    parameters and the step dz_i of the initial state of each run.
+    parameters and the step dz_i of the initial state of each run. With the derivatives A_i by the
+    parameters, B_i by the initial state, and the residual r_i: U = sum A_i'A_i, W_i = A_i'B_i, V_i
+    = B_i'B_i + 1 / pi^2, a = sum A_i'r_i, b_i = B_i'r_i - d_i / pi.
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
@@ -282,9 +286,13 @@ def _predict_decrease(
 ) -> float:
     """Return by how much a step would decrease the cost if the residual were linear, eq. (6).
 
-    The damping is adapted to how well the actual decrease agrees with it. It is sum |r_i|^2 - |r_i
-    - A_i dx - B_i dz_i|^2 + sum |d_i|^2 - |d_i + dz_i / pi|^2, with residuals r_i and deviations
-    d_i of the initial states in units of the prior pi.
+    The damping is adapted to how well the actual decrease agrees with it. It is
+
+        sum_i |r_i|^2 - |r_i - A_i dx - B_i dz_i|^2 + sum_i |d_i|^2 - |d_i + dz_i / pi|^2,
+
+    with the residual r_i of run i, its derivatives A_i by the parameters and B_i by the initial
+    state, the steps dx and dz_i, and the deviation d_i of the initial state in units of the prior
+    pi.
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
@@ -355,10 +363,10 @@ def build_displaced_inputs(
     q, state_count = free.size, state_indices.size
     theta = np.tile(start.theta, (1 + q + state_count, 1))
     states = np.tile(start.initial_states, (1 + q + state_count, 1, 1))
-    for j, place in enumerate(free):
-        theta[1 + j, place] += steps[j]
-    for j, place in enumerate(state_indices):
-        states[1 + q + j, :, place] += steps[q + place]
+    for entry, parameter_index in enumerate(free, start=1):
+        theta[entry, parameter_index] += steps[entry - 1]
+    for entry, state_index in enumerate(state_indices, start=1 + q):
+        states[entry, :, state_index] += steps[q + state_index]
     return theta, states
 
 

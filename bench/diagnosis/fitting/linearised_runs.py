@@ -18,10 +18,10 @@ def compute_effect_responses(
 ) -> Array:
     """Compute how the runs of a robot change to first order if one effect is added, for K effects.
 
-    Linearised dynamics cost much less than a simulation for each effect. Series effects (joints in
-    series) cannot be linearised; they are simulated, and the result is cached. The result has
-    single precision, because it is by far the largest array of an explanation and only a
-    derivative.
+    Linearised dynamics cost much less than a simulation for each effect. Series effects (a further
+    joint in series with a joint, such as backlash) cannot be linearised; they are simulated, and
+    the result is cached. The result has single precision, because it is by far the largest array of
+    an explanation and only a derivative.
 
     Shapes: R runs, T samples, C channels, P parameters, s states of a run.
 
@@ -37,7 +37,7 @@ def compute_effect_responses(
     runs, length, channels = evaluator.observed.shape
     responses: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
     cached_responses = evaluator.cached_responses
-    keys = [(name, c.tobytes()) for name, c in added]
+    keys = [(name, coefficients.tobytes()) for name, coefficients in added]
     missing_indices = [i for i, key in enumerate(keys) if key not in cached_responses]
     worker_arguments = [
         (run, theta, states[run], [added[i] for i in missing_indices]) for run in range(runs)
@@ -50,12 +50,12 @@ def compute_effect_responses(
             responses[missing_indices, run, : values.shape[1]] = values
         evaluator.simulation_count += simulation_count
     responses[~is_finite_response(responses)] = np.nan
-    for i, key in enumerate(keys):
+    for i, (name, _) in enumerate(added):
+        key = keys[i]
         if key in cached_responses:
             responses[i] = cached_responses[key]
-        elif is_series_effect(evaluator.available_effects[key[0]]):
-            # Responses without a linearisation are simulated, and are similar in all models near
-            # the data.
+        elif is_series_effect(evaluator.available_effects[name]):
+            # Simulated responses cost more, and are similar in all models near the data.
             cached_responses[key] = responses[i].copy()
     return responses
 
@@ -155,7 +155,8 @@ def _get_linearisation(
 ) -> RunLinearisation:
     """Return the dynamics of a robot linearised along one run, at given parameters.
 
-    The latest linearisations are cached, one for each run, because most are used more than once.
+    The most recently used linearisations are cached, as many as there are runs, because most are
+    used more than once.
 
     Shapes: P parameters, s states of a run.
 
@@ -179,7 +180,7 @@ def _get_linearisation(
             states[coordinate_count:],
         )
     cache[key] = linearisation
-    # Drop the linearisations that were not used for the longest time.
+    # The cache is ordered by the last use. Drop the linearisations unused for the longest time.
     for oldest_key in list(cache)[: -len(evaluator.prepared_runs)]:
         del cache[oldest_key]
     return linearisation

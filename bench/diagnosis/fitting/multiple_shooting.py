@@ -66,8 +66,10 @@ def make_segment_evaluator(evaluator: RunEvaluator) -> RunEvaluator | None:
 def _split_run(run: Run) -> list[Run]:
     """Split a run into segments of equal length, or return it whole if one is too sparse.
 
+    A segment is too sparse if it has less than half of `MIN_MEAN_SEGMENT_SAMPLES` samples.
+
     Args:
-        run: Recorded run.
+        run: recorded run.
 
     Returns:
         At most `SEGMENTS_PER_RUN` segments, each with its own initial state in a fit.
@@ -117,6 +119,7 @@ def forgets_initial_state(evaluator: RunEvaluator, noise: NoiseModel, derivative
             for known states.
     """
     observed_mask = np.isfinite(evaluator.observed)[..., None]
+    # Influence of each state (R, T, s) on the channel that shows it most, in units of the noise.
     state_influence = np.abs(np.where(observed_mask, derivatives / noise.sigma[:, None], 0.0)).max(
         axis=2
     )

@@ -84,6 +84,9 @@ def iterate_rounds(iterations: int, is_racing: bool) -> Iterator[RacingRound]:
 def eliminate_losing_fits(fit_states: Sequence[FitState], lowest_cost: float) -> None:
     """Mark fits as finished if several more steps would not bring them close to the best cost.
 
+    The cost is the sum of squares. The decrease that a fit may still reach is taken as a multiple
+    of the decrease that was predicted for its last step.
+
     Args:
         fit_states: states of the fits; `is_finished` is set in place.
         lowest_cost: lowest cost of other fits.
@@ -148,8 +151,8 @@ class TrajectoryFitter:
         All fits advance together in racing rounds of several Levenberg-Marquardt steps:
 
         1. Stop if all fits have ended, or the search has to end.
-        2. Split the unfinished fits into groups, and advance each group in a worker.
-        3. Pass the lowest cost to the next round, in which fits that are far behind end.
+        2. Find the lowest cost; when racing, fits that are far behind it end in this round.
+        3. Split the unfinished fits into groups, and advance each group in a worker.
 
         Args:
             starts: starts of the fits; one or more.
@@ -165,7 +168,6 @@ class TrajectoryFitter:
         fit_states = [self._create_fit_state(start) for start in starts]
         for racing_round in iterate_rounds(iterations, is_racing):
             # 1. Unfinished fits.
-            # Unfinished fits continue in groups, which exchange nothing within a round.
             unfinished = [i for i, fit_state in enumerate(fit_states) if not fit_state.is_finished]
             if not unfinished or (
                 racing_round.first
@@ -174,8 +176,9 @@ class TrajectoryFitter:
                 )
             ):
                 break
+            # 2. Lowest cost.
             best = min(lowest_cost, *(fit_state.point.cost for fit_state in fit_states))
-            # 2. Groups.
+            # 3. Groups, which exchange nothing within a round.
             groups = self._group_fits(fit_states, unfinished)
             worker_arguments = [
                 (
@@ -215,31 +218,35 @@ class TrajectoryFitter:
         """Split unfinished fits into groups that workers advance in parallel.
 
         A group simulates about `GROUP_COST_SAMPLES` samples in a step, so that the groups are large
-        enough to be worth a message and small enough to share the work. Models of one kind, which
-        can share an engine call, are in one group as far as possible. There is only one group if
-        large engine calls cost less per batch element.
+        enough to be worth a message and small enough to share the work. Models that need the same
+        time steps, which can share an engine call, are in one group as far as possible. There is
+        only one group if large engine calls cost less per batch element.
 
         Args:
             fit_states: states of all fits.
             unfinished: indices of the fits that have not ended.
+
+        Returns:
+            For each group, the indices of its fits.
         """
         evaluator = self.evaluator
         if not evaluator.is_cheap_to_split:
             return [list(unfinished)]
         run_count, length, _ = evaluator.observed.shape
         state_count = self._list_displaced_states().size
+        # Batch elements of a step: each run of each fit, without and with each unknown displaced.
         element_count = (
             sum(1 + fit_states[i].free_indices.size + state_count for i in unfinished) * run_count
         )
         cost = element_count * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
         # Compiled batch elements are stepped in parallel, however long they are.
         group_count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, element_count / MIN_CHUNK_SIZE)))
-        element_kinds = evaluator.group_compatible(
+        step_kinds = evaluator.group_compatible(
             np.stack([fit_states[i].point.start.theta for i in unfinished])
         )
-        ordered_fits = [unfinished[i] for i in np.argsort(element_kinds, kind="stable")]
+        ordered_fits = [unfinished[i] for i in np.argsort(step_kinds, kind="stable")]
         groups = np.array_split(ordered_fits, min(group_count, len(ordered_fits)))
-        return [part.tolist() for part in groups]
+        return [group.tolist() for group in groups]
 
     def advance_round(
         self,
@@ -252,11 +259,12 @@ class TrajectoryFitter:
 
         1. In the first round, simulate the starts.
         2. End fits that are far behind, if racing.
-        3. Compute derivatives where they are not accurate enough.
+        3. Compute derivatives where they are not accurate enough. When racing, this waits for fits
+           that may have converged until it is known that they are not far behind.
         4. Propose a step for each fit, simulate all of them together, and accept or reject each.
 
         Args:
-            fit_states: states of the fits.
+            fit_states: states of the fits, changed in place.
             racing_round: first and last step of this round.
             is_racing: whether to stop fits that are far behind the best fit or behind
                 `lowest_cost`.
@@ -283,6 +291,7 @@ class TrajectoryFitter:
             )
             # 4. Steps.
             trials = list(self._propose_trials(fit_states, sample_mask))
+            # Fits that wait for derivatives continue in a later iteration.
             if not trials and any(p.is_waiting and not p.is_finished for p in fit_states):
                 continue
             # The caller checks whether the fit was stopped early here.
@@ -302,8 +311,9 @@ class TrajectoryFitter:
     def _simulate_starts(self, fit_states: Sequence[FitState], sample_mask: Mask) -> None:
         """Simulate the start of each fit, and compute its derivatives unless they are known.
 
-        All starts without known derivatives are simulated in one engine call, all others in a
-        second one.
+        1. Starts without known derivatives are simulated in one engine call, with derivatives.
+        2. All others are simulated in a second one. Known are only derivatives by parameters, so
+           those by initial states are added.
 
         Shapes: R runs, T samples, C channels.
 
@@ -313,31 +323,31 @@ class TrajectoryFitter:
         """
         known_states = [p for p in fit_states if self._has_derivatives(p)]
         unknown_states = [p for p in fit_states if not self._has_derivatives(p)]
+        # 1. Without known derivatives.
         if unknown_states:
             points = self._simulate_points(
                 [(p, p.point.start) for p in unknown_states], sample_mask
             )
             for fit_state, point in zip(unknown_states, points, strict=True):
                 self._move_to_point(fit_state, point)
+        # 2. With known derivatives.
         if known_states:
             points = self._simulate_without_derivatives(
                 [(p, p.point.start) for p in known_states], sample_mask
             )
             for fit_state, point in zip(known_states, points, strict=True):
-                assert point.start.known_jacobian is not None
+                known_jacobian = point.start.known_jacobian
+                assert known_jacobian is not None
+                # Only the first part of each run may be simulated.
+                sample_count = point.simulated.shape[1]
                 state_jacobian = self._compute_initial_state_derivatives(
-                    fit_state, point.start, point.simulated.shape[1]
+                    fit_state, point.start, sample_count
                 )
-                parameter_jacobian = point.start.known_jacobian.jacobian[
-                    :, : point.simulated.shape[1]
-                ]
-                self._move_to_point(
-                    fit_state,
-                    replace(
-                        point, jacobian=np.concatenate([parameter_jacobian, state_jacobian], axis=3)
-                    ),
+                jacobian = np.concatenate(
+                    [known_jacobian.jacobian[:, :sample_count], state_jacobian], axis=3
                 )
-                fit_state.has_own_jacobian = point.start.known_jacobian.is_at_start
+                self._move_to_point(fit_state, replace(point, jacobian=jacobian))
+                fit_state.has_own_jacobian = known_jacobian.is_at_start
 
     @property
     def _updates_derivatives(self) -> bool:
@@ -366,16 +376,17 @@ class TrajectoryFitter:
     ) -> None:
         """Compute new derivatives for the fits whose present ones predict steps poorly.
 
-        Others continue with Broyden's updates, which need no simulations. Derivatives by initial
-        states are those of the base model, which all models share, until a fit needs its own
-        (`needs_own_state_jacobian`).
+        Others continue with Broyden's updates, which need no simulations. A robot's derivatives by
+        initial states are those of the base model, which all models share, until a fit needs its
+        own (`needs_own_state_jacobian`); these are then computed first.
 
         Shapes: R runs, T samples, C channels.
 
         Args:
             fit_states: states of the fits, changed in place.
             sample_mask: (R, T, C) samples that count in the cost.
-            includes_waiting: whether fits that wait for new derivatives are included.
+            includes_waiting: whether to include fits that may have converged, whose derivatives
+                are only needed if they are not far behind other fits.
         """
         stale_states = [
             p
@@ -405,10 +416,11 @@ class TrajectoryFitter:
             self._move_to_point(fit_state, point)
 
     def _replace_first_states(self, fit_state: FitState, sample_mask: Mask) -> None:
-        """Replace the first states of runs that the guessed ones explain better.
+        """Replace the initial states of runs that the guessed ones explain better.
 
         Steps with wrong derivatives may have moved a joint to where it slides at first, and then
-        sticks in the same place from wherever it began.
+        sticks in the same place from wherever it began. No fit would find back from there. Each run
+        is compared on its own.
 
         Args:
             fit_state: state of the fit, whose point is changed in place.
@@ -428,9 +440,10 @@ class TrajectoryFitter:
         """Create the state of a new fit: fitted parameters, their bounds and difference steps.
 
         Args:
-            start: Effects, theta and initial states from which the fit begins.
+            start: effects, theta and initial states from which the fit begins.
         """
         evaluator = self.evaluator
+        # Bounds of the fitted parameters by index in theta: base parameters, then coefficients.
         bounds: dict[int, tuple[float, float]] = {}
         if self.fits_parameters:
             base = [i for i in evaluator.base_indices.tolist() if i not in self.fixed_parameters]
@@ -443,7 +456,7 @@ class TrajectoryFitter:
 
         # Plausible ranges scale the finite differences; a fit may go far beyond them.
         plausible_ranges = [evaluator.parameters[i].bounds for i in fitted_indices]
-        widths = np.array([b - a for a, b in plausible_ranges], dtype=np.float64)
+        widths = np.array([upper - lower for lower, upper in plausible_ranges], dtype=np.float64)
         state_steps = np.full(len(evaluator.state_names), INITIAL_STATE_STEP)
 
         # A start may have a size from a score test, or come from wider bounds.
@@ -469,7 +482,7 @@ class TrajectoryFitter:
 
         One engine call contains every run of every model with every unknown displaced, so it
         integrates over time only once. An initial state that is known in every run is not an
-        unknown.
+        unknown. A robot's derivatives by initial states come from a linearisation instead.
 
         Shapes: R runs, T samples, C channels.
 
@@ -628,12 +641,11 @@ class TrajectoryFitter:
     def _compute_state_deviation(self, states: Array) -> Array:
         """Return initial states minus their guesses (R, s), in prior standard deviations.
 
-        Their squares are a term of the cost, eq. (1) of `levenberg_marquardt_step`.
+        For run i it is d_i = (z_i - g_i) / pi, with the initial state z_i and the mean g_i and
+        standard deviation pi of its prior. The squares are a term of the cost, eq. (1) of
+        `levenberg_marquardt_step`.
 
         Shapes: R runs, s states of a run.
-
-        For run i it is d_i = (z_i - g_i) / pi, with the initial state z_i and the mean g_i and
-        standard deviation pi of its prior.
         """
         deviation: Array = (states - self.evaluator.initial_state_guesses) / compute_state_prior(
             self.evaluator
@@ -652,13 +664,11 @@ class TrajectoryFitter:
     def _compute_cost(self, simulated: Array, states: Array, sample_mask: Mask) -> float:
         """Return the sum of squares of the whitened residual and of the state deviations.
 
-        It is the cost, eq. (1) of `levenberg_marquardt_step`, and infinite if the simulation was
-        abandoned.
+        This is the cost, eq. (1) of `levenberg_marquardt_step`: sum_i |r_i|^2 + sum_i |d_i|^2, with
+        the whitened residual r_i of run i and the deviation d_i of its initial state from the prior
+        mean, in standard deviations. It is infinite if a simulation was abandoned.
 
         Shapes: R runs, T samples, C channels, s states of a run.
-
-        The cost is sum_i |r_i|^2 + sum_i |d_i|^2, with the whitened residual r_i of run i and the
-        deviation d_i of its initial state from the prior.
 
         Args:
             simulated: (R, T, C) simulated runs.
@@ -668,7 +678,10 @@ class TrajectoryFitter:
         return float(self._compute_run_costs(simulated, states, sample_mask).sum())
 
     def _compute_run_costs(self, simulated: Array, states: Array, sample_mask: Mask) -> Array:
-        """Return the part of each run (R,) in the cost; arguments as those of `_compute_cost`."""
+        """Return the part of each run (R,) in the cost; arguments as those of `_compute_cost`.
+
+        It is infinite for a run whose simulation was abandoned.
+        """
         deviation = self._compute_state_deviation(states)
         with np.errstate(all="ignore"):
             residual = self._compute_residual(simulated, sample_mask)
@@ -701,8 +714,8 @@ class TrajectoryFitter:
     def _propose_trial(self, fit_state: FitState, sample_mask: Mask) -> FitStart | None:
         """Return the next parameters and initial states to try: one damped Gauss-Newton step.
 
-        If no decrease is predicted, mark the fit as finished or waiting, and return None.
-        Parameters at a bound that the data push against do not move.
+        Parameters at a bound that the data push against do not move. If hardly any decrease of the
+        cost is predicted, mark the fit as finished or as waiting for derivatives, and return None.
 
         Shapes: R runs, T samples, C channels.
 
@@ -752,18 +765,21 @@ class TrajectoryFitter:
     def _accept_or_reject_trial(self, fit_state: FitState, point: FitPoint) -> None:
         """Accept a trial point if its cost is lower, else reject it, and update the damping.
 
-        Derivatives are updated by Broyden's method if the trial was simulated without them.
+        If the trial was simulated without derivatives, Broyden's method updates those of the last
+        point.
 
         Args:
             fit_state: state of the fit, changed in place.
             point: the simulated trial point.
         """
         decrease = fit_state.point.cost - point.cost
+        # Whether the step was computed with derivatives of the point where it began.
         is_own_jacobian = fit_state.has_own_jacobian
         if point.cost < fit_state.point.cost:
             if self._updates_derivatives:
                 fit_state.point = replace(point, jacobian=fit_state.update_jacobian(point))
-                # A robot's derivatives by initial states come from a linearisation.
+                # Updated derivatives are approximate. Those of a robot by initial states, from a
+                # linearisation, count as exact if no parameter is fitted.
                 is_linearised = self.evaluator.has_linearisation
                 fit_state.has_own_jacobian = is_linearised and not fit_state.free_indices.size
             else:

@@ -72,7 +72,11 @@ class BaseModel:
         return ", ".join(parameters[i].name for i in sorted(indices))
 
     def rate(self) -> tuple[float, float]:
-        """Return twice the log-likelihood and the RMS residual in units of the noise."""
+        """Rate the fit on the fitted runs.
+
+        Returns:
+            Twice the log-likelihood, and the RMS residual in units of the noise.
+        """
         search = self.runs.create_search(self.fit)
         model = search.base_model
         return float(model.likelihood.value), 1.0 + search.compute_excess_residual(model)
@@ -161,7 +165,8 @@ class BaseModel:
         runs, followed = self.runs, self.runs.fitting.filtered_runs
         if followed is None or followed.has_missing_force or not self.is_usable:
             return self
-        if self.rate()[1] < MIN_REFITTED_RESIDUAL:
+        _, residual_rms = self.rate()
+        if residual_rms < MIN_REFITTED_RESIDUAL:
             return self
         start = find_first_states(runs.fitting, runs.noise, self.fit.fit)
         if start is None:
@@ -172,18 +177,19 @@ class BaseModel:
         """Return the duration in seconds of segments that a simulation can follow.
 
         An unstable or chaotic motion amplifies the error of an estimated first state, until no
-        simulation follows it. Shorter segments begin at new first states. The longest duration with
-        a small amplification is returned; if no duration has one, the shortest.
+        simulation follows it. Shorter segments begin at new first states.
 
         Returns:
-            Duration in seconds; None if the base model follows whole runs, or if they amplify
-            errors little.
+            The longest of `SEGMENT_DURATIONS` with a small amplification, or the shortest if none
+            has one. None if whole runs can be used: the base model simulates them well, they
+            amplify errors little, or no filter can tell.
         """
         followed = self.runs.fitting.filtered_runs
         if followed is None or not self.is_usable:
             return None
-        is_followed = self.rate()[1] < MIN_UNFOLLOWED_RESIDUAL
-        if is_followed or not followed.compute_amplification() > MAX_RUN_AMPLIFICATION:
+        _, residual_rms = self.rate()
+        is_simulated = residual_rms < MIN_UNFOLLOWED_RESIDUAL
+        if is_simulated or not followed.compute_amplification() > MAX_RUN_AMPLIFICATION:
             return None
         for seconds in SEGMENT_DURATIONS:
             if followed.compute_amplification(seconds) <= MAX_SEGMENT_AMPLIFICATION:
@@ -202,8 +208,8 @@ class BaseModel:
             for angle in ANGLES
         ]
         evaluator = self.runs.fitting
-        rows = [c for c, name in enumerate(evaluator.channels) if name in names]
-        errors = (self.fit.fit.simulated - evaluator.observed)[..., rows]
+        angle_channels = [c for c, name in enumerate(evaluator.channels) if name in names]
+        errors = (self.fit.fit.simulated - evaluator.observed)[..., angle_channels]
         return bool(np.nanmax(np.abs(errors), initial=0.0) > MAX_ROTATION_ERROR)
 
 
@@ -231,15 +237,20 @@ def filter_runs(runs: SimulatedRuns) -> None:
     """Filter the runs of a robot with the present model (Kalman filter and smoother).
 
     The filter, stored in the evaluators, provides initial states and starting values of free
-    parameters, and later the search by prediction errors. If the linearised model diverges, nothing
-    is stored, and causes are searched by simulation; for a robot in contact, a nonlinear filter
-    then estimates the initial states.
+    parameters, and later the search by prediction errors.
+
+    1. Filter the runs for fitting with the numbers of the model file. If the linearised model is
+       not valid, nothing is stored, and causes are searched by simulation; for a robot in contact,
+       a nonlinear filter then estimates the initial states.
+    2. Filter them again with fitted base parameters, unless a tuner fits these.
+    3. Filter the held-out runs.
     """
     # This import is needed for robots only.
     from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
     context = runs.context
     context.search_control.begin_stage("computing prediction errors")
+    # 1. Model file.
     filtered_runs = runs.nominal_filter
     is_nonlinear = runs.contacts.needs_nonlinear_filter(filtered_runs)
     if is_nonlinear or not filtered_runs.has_expected_innovations:
@@ -250,11 +261,13 @@ def filter_runs(runs: SimulatedRuns) -> None:
             theta = runs.fitting.get_nominal_theta()
             set_first_states_in_contact(runs.evaluators, theta, runs.noise.sigma)
         return
+    # 2. Base parameters.
     if runs.fitting.base_indices.size and context.options.tuner is None:
         filtered_runs = _filter_with_fitted_parameters(runs)
     runs.fitting.follow(filtered_runs)
     if context.search_control.is_over():
         return
+    # 3. Held-out runs.
     for evaluator in runs.evaluators[1:]:
         # Held-out runs are only simulated; without a filter they begin at their measured values.
         theta = evaluator.get_nominal_theta()

@@ -49,11 +49,14 @@ class CauseSearch:
     def search(self, base: BaseModel) -> SearchResult:
         """Search for causes; repeat with MuJoCo's soft dry friction if the data support that form.
 
-        A search ends with `SoftFrictionError` if it finds the soft form likelier. There are three
-        outcomes: the search ends with stiff friction; it is repeated with soft friction, whose
-        result counts; or, if the soft form was chosen before other effects were fitted
-        (`is_preliminary`) and then explains nothing, it is repeated with stiff friction after all,
-        without asking for the form again.
+        The first search uses stiff friction, and ends with `SoftFrictionError` if it finds the soft
+        form likelier. There are three outcomes:
+
+        * the search ends with stiff friction;
+        * it is repeated with soft friction, whose result counts;
+        * the soft form was chosen before other effects were fitted (`is_preliminary`), and does not
+          explain the data: the search is repeated with stiff friction, and tests the form only
+          after effects have been fitted.
 
         Args:
             base: the fitted base model.
@@ -79,12 +82,12 @@ class CauseSearch:
                 and not result.errors
                 and not runs.context.search_control.is_over()
             )
-            if not is_comparison_needed or (
-                refit_if_likelier_soft(
-                    search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-                )
-                is None
-            ):
+            if not is_comparison_needed:
+                return result
+            soft_model = refit_if_likelier_soft(
+                search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+            )
+            if soft_model is None:
                 return result
             return self._search_with_soft_friction(base, search)
         except SoftFrictionError as error:

@@ -71,13 +71,14 @@ class HeldOutGains:
         if runs is None or () not in held_out_fits:
             return indices[usual_unit]
         before = held_out_fits[()].simulated
+        # RMS error of the base model over the channels of each unit, relative to their noise.
         ratios = {
             unit: _compute_rmse(runs, before, channels) / compute_rms(self.noise_sigma[channels])
             for unit, channels in indices.items()
         }
-        largest = max(ratios, key=lambda unit: ratios[unit])
-        is_elsewhere = ratios[usual_unit] < NOISE_RATIO < ratios[largest]
-        return indices[largest if is_elsewhere else usual_unit]
+        unit_of_largest = max(ratios, key=lambda unit: ratios[unit])
+        is_visible_elsewhere = ratios[usual_unit] < NOISE_RATIO < ratios[unit_of_largest]
+        return indices[unit_of_largest if is_visible_elsewhere else usual_unit]
 
     @property
     def _noise_floor(self) -> float:

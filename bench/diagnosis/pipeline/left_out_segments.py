@@ -14,10 +14,10 @@ MAX_LEFT_OUT_SHARE = 0.25
 
 
 def leave_out_unpredictable_segments(runs: SimulatedRuns) -> SimulatedRuns:
-    """Leave out segments that no simulation predicts: those that not even a filter follows.
+    """Leave out segments that no simulation predicts: those that not even a Kalman filter follows.
 
-    If the filter does not follow most of the segments for fitting, the model may be wrong instead,
-    and all of them are kept; likewise those for measuring.
+    Runs for fitting and held-out runs are treated separately. If the filter follows less than half
+    of them, the model may be wrong instead, and all of them are kept.
     """
     # This import is needed for robots only.
     from bench.diagnosis.kalman.linearised_filter import FollowedRuns
@@ -53,10 +53,11 @@ def leave_out_jumps(runs: SimulatedRuns, simulated: Array) -> SimulatedRuns:
         The remaining segments; `runs` itself if none is left out.
     """
     residual = (simulated - runs.fitting.observed) / runs.noise.sigma
-    sizes = np.sqrt(np.nanmean(np.square(residual), axis=(1, 2)))
-    median = float(np.median(sizes))
-    has_jump = sizes > MAX_RESIDUAL_RATIO * median
+    residual_rms = np.sqrt(np.nanmean(np.square(residual), axis=(1, 2)))  # (R,)
+    median = float(np.median(residual_rms))
+    has_jump = residual_rms > MAX_RESIDUAL_RATIO * median
     is_rare = 0 < has_jump.sum() <= MAX_LEFT_OUT_SHARE * has_jump.size
+    # If most segments are above the noise, the model lacks something else.
     if not median < MAX_RESIDUAL_RATIO or not is_rare:
         return runs
     return runs.without([runs.fitting.runs[i].name for i in np.flatnonzero(has_jump)])

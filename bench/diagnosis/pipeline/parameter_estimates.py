@@ -40,8 +40,10 @@ class ParameterEstimates:
     def values(self) -> dict[int, FittedValue]:
         """Estimates by index in the parameter vector, with 95 % intervals where the data give some.
 
-        Unfitted parameters, those at a bound of their range, and all of an unfinished fit have no
-        interval. An estimate outside its plausible range is marked with this range.
+        * Unfitted parameters, those at a bound of their range, and all of an unfinished fit have no
+          interval.
+        * An estimate outside its plausible range is marked with this range.
+        * For a robot, the numbers of the model file and the resulting totals are added.
         """
         evaluator, model = self.search.evaluator, self.model
         intervals = compute_intervals(self.search, model)
@@ -129,20 +131,19 @@ class ParameterEstimates:
         that acts at all places is divided into its members.
         """
         evaluator, kind = self.search.evaluator, cast(Any, self.search.evaluator.kind)
-        # The free numbers of the user come first, in the order of their effects.
-        indices = iter(range(evaluator.system_parameter_count))
+        # The free numbers of the user come first in theta, in the order of their effects.
+        remaining_indices = iter(range(evaluator.system_parameter_count))
         for effect in kind.system.freed_effects:
-            yield effect, [next(indices) for _ in effect.coefficients]
+            yield effect, [next(remaining_indices) for _ in effect.coefficients]
         for name in self.model.effects:
-            effect = evaluator.available_effects[name]
-            members = members_of(effect)
-            indices = iter(evaluator.get_coefficient_indices(name))
+            members = members_of(evaluator.available_effects[name])
+            indices = evaluator.get_coefficient_indices(name)
             # A family with one coefficient for all places changes no number of the file.
-            if sum(len(member.coefficients) for member in members) == len(
-                evaluator.get_coefficient_indices(name)
-            ):
-                for member in members:
-                    yield type(member), [next(indices) for _ in member.coefficients]
+            if sum(len(member.coefficients) for member in members) != len(indices):
+                continue
+            remaining_indices = iter(indices)
+            for member in members:
+                yield type(member), [next(remaining_indices) for _ in member.coefficients]
 
     def select_coefficients(self, name: str) -> dict[str, FittedValue]:
         """Return the estimates of an effect by the names of its coefficients.
@@ -192,7 +193,9 @@ class ParameterEstimates:
     def are_results(self, effects: Iterable[str]) -> bool:
         """Return whether the coefficients of effects are results, and no parameter is at a bound.
 
-        A cause may compensate for a value of a base parameter beyond a bound of its range.
+        A result has a finite interval. A base parameter at a bound of its range counts, because a
+        cause may compensate for a value beyond the bound; one that is a result nevertheless, such
+        as zero at a physical limit, does not.
 
         Args:
             effects: names of the effects.

@@ -136,8 +136,9 @@ def _estimate_parameters_by_group(
     """Return the estimates by run, log or load of the best effect other than a single cause.
 
     They let the report compare how consistent the cause and its best competitor are: a wrong effect
-    needs another coefficient in each group. Effects that are part of the diagnosis are not
-    competitors. The result is empty without a competitor, or if there is not exactly one cause.
+    needs another coefficient in each group. The competitor is the likeliest single effect with one
+    coefficient that is not part of the diagnosis. The result is empty without a competitor, or if
+    there is not exactly one cause.
     """
     if len(finding.causes) != 1:
         return ()
@@ -156,12 +157,12 @@ def _estimate_parameters_by_group(
         return ()
     best = max(other_models, key=lambda model: model.penalised_log_likelihood)
     (name,) = best.effects
-    group_estimates = [
+    return tuple(
         consistency
         for consistency in assess_consistency(search, best)
+        # Only the coefficient of the effect, and not the base parameters.
         if consistency.number.startswith(name)
-    ]
-    return tuple(group_estimates)
+    )
 
 
 def _assess_identifiability(search: EffectSearch) -> tuple[ParameterIdentifiability, ...]:
@@ -275,11 +276,13 @@ def _list_unexplained(result: SearchResult) -> Iterator[str]:
 def _warn_of_bounds(changes: Sequence[ParameterChange]) -> Iterator[str]:
     """Yield a warning for each base parameter whose fitted value is at a bound of its range.
 
-    The value may then be wrong, and a cause may compensate for it. One warning is given for each
-    parameter, for the base fit if both fits end at a bound.
+    The value may then be wrong, and a cause may compensate for it. There are two fits, that of the
+    base model and that of the model with the causes. Of a parameter that is at a bound in both,
+    only the base fit is reported.
     """
     for parameter in changes:
-        values = parameter.before[0], parameter.after[0]
+        (value_before, *_), (value_after, *_) = parameter.before, parameter.after
+        values = value_before, value_after
         for fit_text, value, bound in zip(
             ("in the base fit ", ""), values, parameter.bounds, strict=True
         ):

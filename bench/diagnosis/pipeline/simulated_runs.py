@@ -150,7 +150,10 @@ class SimulatedRuns:
         return cls(context, kind, recording, fitting, floor, noise, validation)
 
     def with_kind(self, kind: type[SystemSimulator]) -> SimulatedRuns:
-        """Return the runs with another class of simulator of the same system."""
+        """Return the runs with another class of simulator of the same system.
+
+        State filters of the runs are taken over.
+        """
         runs = SimulatedRuns.build(self.context, kind, self.recording)
         for known, evaluator in zip(self.evaluators, runs.evaluators, strict=True):
             # The initial states of the runs depend little on the numerical settings.

@@ -177,8 +177,8 @@ class SolverOptionChoice:
 def _improve_options(rated: RatedOptions) -> RatedOptions:
     """Return the best options, changed one after the other while the base model improves.
 
-    In each round, a fast estimate ranks the alternatives, and the base model is fitted with the
-    best few.
+    In each round, a fast estimate ranks the alternatives (settings with one option changed), and
+    the base model is fitted with the best few.
 
     Args:
         rated: The options of the model file.
@@ -196,6 +196,7 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
             if runs.context.search_control.is_over():
                 break
             robot: Any = runs.kind
+            # The runs take over the filter of the alternative before, if it has one.
             runs = runs.with_kind(robot.with_integrator_settings(alternative.numerics))
             if runs.fitting.filtered_runs is None:
                 filter_runs(runs)
@@ -210,10 +211,11 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
 def _has_competing_effect(options: RatedOptions, file_options: RatedOptions) -> bool:
     """Return whether an effect may explain the recording as other options of the solver do.
 
-    The gain of the effects, by a scan of their coefficients or by linear scores, is compared with
-    that of the options. Far from the noise, only effects at contacts are tried: others would not
-    imitate an option. Laws with many shapes are not tried, because an option is the simpler
-    explanation.
+    1. Scan the coefficients of effects at contacts by simulation. Far from the noise, linear scores
+       are not valid, so that these effects alone decide, by the sum of squares.
+    2. Score all other effects to first order, except laws with many shapes: an option is the
+       simpler explanation.
+    3. Compare the gain in twice the log-likelihood of the best effect with that of the options.
 
     Args:
         options: the other solver options, with the base model fitted to them.
@@ -227,15 +229,18 @@ def _has_competing_effect(options: RatedOptions, file_options: RatedOptions) -> 
 
     runs = file_options.model.runs
     search = runs.create_search(file_options.model.fit)
+    # 1. Effects at contacts.
     lowest_squares = find_lowest_scan(search)
     if file_options.residual > MAX_LINEAR_RESIDUAL:
         return lowest_squares < MAX_COMPETING_SQUARES_RATIO * options.model.fit.fit.cost
+    # 2. Other effects.
     exclude_laws_with_many_shapes(search)
     model = search.base_model
+    score = float(search.score_missing_effects(model).score.max(initial=0.0))
+    # 3. Gains.
     squares = np.square(search.compute_residual(model.fit) / runs.noise.sigma).sum()
-    effect_gains = (
-        float(search.observed_mask.sum()) * float(np.log(squares / lowest_squares)),
-        float(search.score_missing_effects(model).score.max(initial=0.0)),
-    )
+    sample_count = float(search.observed_mask.sum())
+    # Twice the log-likelihood of white noise is -n log(sum of squares), up to a constant.
+    scan_gain = sample_count * float(np.log(squares / lowest_squares))
     option_gain = options.log_likelihood - file_options.log_likelihood
-    return max(effect_gains) > MIN_COMPETING_GAIN_SHARE * option_gain
+    return max(scan_gain, score) > MIN_COMPETING_GAIN_SHARE * option_gain

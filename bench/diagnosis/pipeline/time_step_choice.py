@@ -61,11 +61,13 @@ class TimeStepChoice:
         from bench.diagnosis.evaluation.discretisation_error import find_step_refinements
 
         runs = model.runs
+        # Copies of a tee share the refinements that were simulated, for `reconsider`.
         (self._refinements,) = tee(find_step_refinements(runs.fitting, runs.noise), 1)
         file_log_likelihood, residual_rms = model.rate()
-        gap = residual_rms - 1.0
+        file_excess = residual_rms - 1.0
+        # The error of a step must be far below `residual_rms`, the residual that remains with the
+        # last step tried. Finer steps leave a smaller one.
         for refinement in copy(self._refinements):
-            # A finer step leaves a smaller residual; a step that is too coarse for it is not tried.
             if not refinement.is_accurate_enough(residual_rms):
                 continue
             runs = runs.with_kind(refinement.kind)
@@ -75,8 +77,9 @@ class TimeStepChoice:
             finer = model.refit(runs)
             log_likelihood, residual_rms = finer.rate()
             gain = log_likelihood - file_log_likelihood
-            if not is_finer_step_better(gain, gap, residual_rms - 1.0):
-                # Another missing effect may affect both models: they are compared again with it.
+            if not is_finer_step_better(gain, file_excess, residual_rms - 1.0):
+                # If the step is exact, a missing effect may affect both models: `reconsider`
+                # compares them with it. Otherwise only an exact step is tried next.
                 if refinement.is_accurate_enough(0.0):
                     break
                 residual_rms = 0.0
@@ -87,11 +90,13 @@ class TimeStepChoice:
     def reconsider(self, result: SearchResult, cause_search: CauseSearch) -> SearchResult:
         """Return the result with another step, if that explains the data better, or this result.
 
-        If `choose` took a finer step, the file's own step is tested; if not, a step that is
-        accurate enough for any residual is. The other step is compared with the effects of this
-        result or some of them. Models are compared by penalised log-likelihood and residual, and a
-        finer step must be clearly better: data that MuJoCo made with the file's own step must not
-        be explained by another. If the other step wins, causes are searched again.
+        1. If `choose` took a finer step, the file's own step is tested.
+        2. If not, a step is tested that is accurate enough for any residual.
+
+        The other step is compared with the effects of this result or some of them. Models are
+        compared by penalised log-likelihood and residual, and a finer step must be clearly better:
+        data that MuJoCo made with the file's own step must not be explained by another. If the
+        other step wins, causes are searched again.
 
         Args:
             result: result with the present step.
@@ -100,8 +105,10 @@ class TimeStepChoice:
         finding, model = result.finding, result.searched_base
         if self._refinements is None or result.has_ended:
             return result
+        # Without causes, no effect can imitate the error of a step.
         if not finding.causes and (self.finding is not None or finding.verdict == "adequate"):
             return result
+        # 1. Step of the file.
         if self._file_runs is not None:
             file_merit = _rate_best_subset(self._file_runs, result)
             if is_finer_model_better(file_merit, result.rate()):
@@ -111,6 +118,7 @@ class TimeStepChoice:
             )
             self.finding = None
             return cause_search.search(model.refit(self._file_runs).finish())
+        # 2. Finer step.
         refinements = copy(self._refinements)
         refinement = next((one for one in refinements if one.is_accurate_enough(0.0)), None)
         # The residual of a model that stays incomplete is far larger than an error of the step.
@@ -120,7 +128,9 @@ class TimeStepChoice:
         merit, finer_merit = result.rate(), _rate_best_subset(runs, result)
         if not is_finer_model_better(merit, finer_merit):
             return result
-        finer = self._use(refinement, finer_merit[0] - merit[0], model, model.refit(runs))
+        (log_likelihood, _), (finer_log_likelihood, _) = merit, finer_merit
+        gain = finer_log_likelihood - log_likelihood
+        finer = self._use(refinement, gain, model, model.refit(runs))
         return cause_search.search(finer.finish())
 
     def _use(
@@ -170,6 +180,7 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
     starts, has_few_effects = [], len(names) <= MAX_SUBSET_EFFECTS
     for count in range(0 if has_few_effects else len(names), len(names) + 1):
         for subset in combinations(names, count):
+            # Coefficients of omitted effects are zero, as in the nominal parameters.
             theta = fit.theta.copy()
             for omitted in set(names) - set(subset):
                 indices = evaluator.coefficient_slices[omitted]

@@ -78,10 +78,14 @@ def restrict_verdict(result: SearchResult) -> DiagnosisResult:
 def _is_refuted(result: SearchResult) -> bool:
     """Return whether fitted models refute a missing effect that only the linear score suggests.
 
-    This is so if no fitted model with effects has a higher penalised log-likelihood than the base
-    model, or none predicts the held-out runs better. In closed loops and at rest, derivatives may
-    predict a gain that no fit achieves. A visible structure of the residual, or a large held-out
-    gap, is not refuted.
+    In closed loops and at rest, derivatives may predict a gain that no fit achieves. A missing
+    effect is refuted if no model with effects is better than the base model on the fitted runs (by
+    penalised log-likelihood) and also on the held-out runs, as far as it was evaluated there. It is
+    not refuted if
+
+    * the diagnosis has causes, or the search ended early;
+    * the residual has structure, or held-out runs show a large discrepancy;
+    * no model with effects was fitted.
     """
     search, finding = result.search, result.finding
     if finding.causes or finding.lack_of_fit.has_structure or finding.early_stop is not None:
@@ -92,12 +96,12 @@ def _is_refuted(result: SearchResult) -> bool:
         for model in extended_models
         if model.penalised_log_likelihood > search.base_model.penalised_log_likelihood
     ]
-    held_out = finding.held_out_fits or {}
     excess = _compute_held_out_excess(result)
-    if not extended_models or (
-        excess is not None and verdict_rules.misses_held_out_gap(excess, excess)
-    ):
+    # The base model alone must leave no large gap on held-out runs.
+    has_held_out_gap = excess is not None and verdict_rules.misses_held_out_gap(excess, excess)
+    if not extended_models or has_held_out_gap:
         return False
+    held_out = finding.held_out_fits or {}
     return not any(
         names not in held_out
         or held_out[names].penalised_log_likelihood > held_out[()].penalised_log_likelihood
@@ -135,7 +139,7 @@ def _list_candidates(search: EffectSearch, gains: HeldOutGains) -> tuple[Candida
         coefficient_slice = search.evaluator.coefficient_slices[effect]
         score -= search.parameter_penalty * (coefficient_slice.stop - coefficient_slice.start - 1)
         candidates.append(Candidate(effect, max(score, 0.0), p_value, share))
-    return tuple(sorted(candidates, key=lambda row: -row.score))
+    return tuple(sorted(candidates, key=lambda candidate: -candidate.score))
 
 
 def _propose_next_run(result: SearchResult) -> DiscriminatingRun | None:

@@ -291,7 +291,7 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
     for _ in range(MAX_STATE_ESTIMATES):
         # 1. Smoother.
         smoothed = smooth_first_states(evaluator, theta, sigma)
-        # The filter diverges with this effect.
+        # The runs cannot be filtered with this effect.
         if smoothed is None:
             return search.fit_one(start)
         # 2. Scan.
