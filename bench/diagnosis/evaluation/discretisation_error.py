@@ -106,18 +106,20 @@ def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterato
     error = motions.compute_rms_difference(motions.of(model_settings), reference)
     if not error > MIN_DISCRETISATION_ERROR:
         return
-    # 3. Settings with a small error.
+    # 3. Settings with a small error. A larger one is also tried, for models with a large residual
+    # (`StepRefinement.is_accurate_enough`).
+    max_error = max(
+        MAX_CORRECTED_ERROR, min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
+    )
     for numerics in _iterate_settings(model_settings):
         corrected_error = motions.compute_rms_difference(motions.of(numerics), reference)
-        if corrected_error < max(
-            MAX_CORRECTED_ERROR, min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
-        ):
+        if corrected_error < max_error:
             yield StepRefinement(
-                kind.with_integrator_settings(numerics),
-                model_settings,
-                numerics,
-                error,
-                corrected_error,
+                kind=kind.with_integrator_settings(numerics),
+                file_settings=model_settings,
+                numerics=numerics,
+                error=error,
+                corrected_error=corrected_error,
             )
 
 

@@ -164,7 +164,8 @@ def _compute_added_noise(recording: Recording, name: str) -> float:
     # A quantised channel has the noise of its steps, also while the robot rests.
     if estimate_noise(signals).step > added_sigma:
         return 0.0
-    # The estimate is not finite if all runs are too short for the differences.
+    # A channel with far less noise than this is noise-free. The estimate is not finite if all runs
+    # are too short for the differences; then nothing is added.
     sigma = estimate_differences_sigma(signals, DIFFERENCE_ORDER)
     return added_sigma if sigma < MAX_NOISE_FREE_SHARE * added_sigma else 0.0
 

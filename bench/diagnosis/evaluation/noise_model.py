@@ -195,7 +195,7 @@ def maximise_likelihood(
 def _maximise_channel_likelihood(
     residual: Array,
     observed_mask: Mask,
-    share: float,
+    freedom_share: float,
 ) -> tuple[float, float, float]:
     """Return the maximum of eq. (4) for one channel, with its correlation and variance.
 
@@ -210,7 +210,7 @@ def _maximise_channel_likelihood(
     Args:
         residual: (R, T, 1) residual.
         observed_mask: (R, T, 1) mask of available samples.
-        share: remaining degrees of freedom, as a fraction of the samples.
+        freedom_share: remaining degrees of freedom, as a fraction of the samples.
 
     Returns:
         Twice the log-likelihood, the correlation phi and the variance.
@@ -225,7 +225,7 @@ def _maximise_channel_likelihood(
         determinant = 2.0 * compute_log_determinant(observed_mask, phi)
         value = -sample_count * np.log(variance) + determinant
         # Tuples are compared by the likelihood first.
-        best = max(best, (value, phi, variance / share))
+        best = max(best, (value, phi, variance / freedom_share))
     return best
 
 

@@ -89,11 +89,14 @@ def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[tuple
 def get_bounds_by_index(
     evaluator: RunEvaluator, names: Iterable[str]
 ) -> dict[int, tuple[float, float]]:
-    """Return the ranges of `compute_coefficient_bounds` for some effects, by index in theta.
+    """Return the range in which a fit may move each coefficient of some effects.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         names: names of the effects.
+
+    Returns:
+        Lower and upper end of the range, by index of the coefficient in theta.
     """
     bounds: dict[int, tuple[float, float]] = {}
     for name in names:
@@ -178,6 +181,7 @@ def _compute_fit_bounds(
     """
     low, high = parameter.bounds
     longest_run = evaluator.longest_duration
+    # An event may happen at any time of the recording.
     if is_instant(parameter):
         return evaluator.time_span
     if parameter.unit == "Hz":

@@ -165,7 +165,7 @@ def _find_unobserved_states(simulator: SystemSimulator) -> set[str]:
 
 
 def take_first_samples(scenario: Scenario, samples: int) -> Scenario:
-    """Return a scenario cut to its first samples.
+    """Return a scenario with all its signals cut to the first samples.
 
     Args:
         scenario: the scenario.

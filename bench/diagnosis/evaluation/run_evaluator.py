@@ -137,7 +137,8 @@ class RunEvaluator:
     ) -> None:
         """Build the simulator with all observable effects, and prepare the runs as padded arrays.
 
-        An effect is included if the recorded channels and inputs can show it.
+        An effect is included if the recorded channels and inputs can show it. Class attributes are
+        described in the docstring of the class.
 
         Args:
             kind: class of the simulator.
@@ -185,7 +186,8 @@ class RunEvaluator:
             self._find_delaying_coefficients()
         )
 
-        # A system without coordinates provides the names of its states itself.
+        # Runs, padded to equal length. A system without coordinates provides the names of its
+        # states itself.
         self.state_names = [*system.coordinates, *system.rates] or list(kind.states)
         self.prepared_runs: tuple[RunData, ...] = tuple(
             prepare_run(run, recording, self.simulator, self.state_names) for run in runs
@@ -200,6 +202,7 @@ class RunEvaluator:
         self.parameters = self._scale_coefficient_ranges()
         self.time_span = self._get_time_span()
         self._channel_ranges: dict[str, float] = {}
+        # What filters and linearisations of a robot provide later.
         self.state_derivatives: Array | None = None
         self.discretisation_correction: Array | None = None
         self.cached_linearisations: dict[tuple[int, bytes, bytes], Any] = {}
@@ -209,6 +212,7 @@ class RunEvaluator:
         self.is_in_contact = False
         self.state_prior: Array | None = None
         self.measured_states: dict[int, Mapping[int, Array]] = {}
+        # Simulation.
         self.simulation_count = 0
         self._cache = SimulationCache()
         self.search_control = SearchControl()
@@ -242,7 +246,10 @@ class RunEvaluator:
 
     @property
     def _engine_settings(self) -> dict[str, Any]:
-        """Settings of the batch engine; the other engines choose their steps themselves."""
+        """Settings of the batch engine: its time step, and when it shortens steps or gives up.
+
+        They are empty for other engines, which choose their steps themselves.
+        """
         if self.engine != "batch":
             return {}
         return {
@@ -307,9 +314,9 @@ class RunEvaluator:
         return self._channel_ranges[name]
 
     def _compute_channel_range(self, name: str) -> float:
-        """Compute the largest range (maximum less minimum) of a channel within one run.
+        """Compute the largest range (maximum minus minimum) of a channel within one run.
 
-        The range is 0 if the channel is not recorded. `_get_channel_range` caches it.
+        It is 0 if the channel is not recorded.
         """
         if name not in self.channels:
             return 0.0
@@ -524,17 +531,13 @@ class RunEvaluator:
         What a filter has estimated, such as initial states, is taken over.
 
         Args:
-            kind: Simulator class, for example with another integrator.
+            kind: simulator class, for example with another integrator.
         """
         evaluator = self._copy(kind, self.runs)
-        evaluator.filtered_runs, evaluator.initial_state_guesses = (
-            self.filtered_runs,
-            self.initial_state_guesses,
-        )
-        evaluator.state_derivatives, evaluator.identified = (
-            self.state_derivatives,
-            self.identified,
-        )
+        evaluator.filtered_runs = self.filtered_runs
+        evaluator.initial_state_guesses = self.initial_state_guesses
+        evaluator.state_derivatives = self.state_derivatives
+        evaluator.identified = self.identified
         evaluator.state_prior = self.state_prior
         evaluator.is_in_contact = self.is_in_contact
         self.worker_pool.register(evaluator)

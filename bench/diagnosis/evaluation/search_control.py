@@ -175,7 +175,8 @@ class SearchControl:
         self._has_abandoned_fits = False
         self._step_text = ""
         self._question = "base_fit"
-        # Weights of finished questions, of the present question, and of the later ones.
+        # Weights of finished questions, of the present question, and of the later ones. The first
+        # step of a question is not finished when it is reported, so the count begins at -1.
         self._finished_weight, self._current_weight = 0.0, QUESTION_SECONDS["base_fit"]
         self._later_weight = _list_later_weights("base_fit")
         self._finished_steps = -1
@@ -203,7 +204,10 @@ class SearchControl:
         self._listener.found(effects, share)
 
     def should_stop(self) -> bool:
-        """Return whether the search has to end; once true, it stays true."""
+        """Return whether the search has to end, because the user stops it or at the deadline.
+
+        Once true, it stays true.
+        """
         if self._stop_reason is None and self._stop():
             self._stop_reason = "interrupt"
         if (

@@ -1,7 +1,7 @@
 """Fitted models of a recording: effects, fit, likelihood and penalised log-likelihood.
 
 For a model with log-likelihood L and k parameters determined by n samples, the penalised
-log-likelihood (merit) is
+log-likelihood is
 
     M = 2 log L - k log n - Σ_e max(c_e - k_e log n, 0)                                          (1)
 
@@ -38,7 +38,7 @@ MIN_SIGMA_SHARE = 1e-3
 MAX_REWEIGHTED_FITS = 4
 """Maximum number of fits of the reported model, each weighted by the previous residual."""
 MIN_GAIN_FOR_REWEIGHTING = 3.0
-"""Minimum gain in merit of such a fit for which another one is made."""
+"""Minimum gain in penalised log-likelihood of such a fit for which another one is made."""
 MAX_REWEIGHTED_SQUARES_RATIO = 1.2
 """Maximum growth factor of the sum of squares in a fit that assumes AR(1) noise.
 
@@ -59,7 +59,7 @@ MIN_EFFECTIVE_SAMPLES = 2
 
 @dataclass(frozen=True)
 class FittedModel:
-    """A fitted model and its merit.
+    """A fitted model and its penalised log-likelihood.
 
     Attributes:
         fit: the fit.
@@ -130,7 +130,7 @@ class ModelSet:
         return residual
 
     def add_fit(self, fit: TrajectoryFit) -> FittedModel:
-        """Compute the merit of a fit, and store it unless a better fit of its effects is known.
+        """Rate a fit, and store it unless a better fit of its effects is known.
 
         The better one is returned.
         """
@@ -200,7 +200,7 @@ class ModelSet:
 
     @property
     def parameter_penalty(self) -> float:
-        """Penalty log n of eq. (1), the merit, for each parameter that the data determine."""
+        """Penalty log n of eq. (1) for each parameter that the data determine."""
         count = int(self.observed_mask.sum())
         return float(np.log(max(count, MIN_EFFECTIVE_SAMPLES)))
 
@@ -405,7 +405,10 @@ class ModelSet:
         return min(costs, default=np.inf)
 
     def get_best(self, size: int) -> FittedModel | None:
-        """Return the model of `size` effects with the highest merit; None if none was fitted."""
+        """Return the model of `size` effects with the highest penalised log-likelihood.
+
+        It is None if no model of this size was fitted.
+        """
         fitted_models = self.models.values()
         models = [m for m in fitted_models if len(m.effects) == size]
         return max(models, key=lambda m: m.penalised_log_likelihood) if models else None
@@ -422,8 +425,8 @@ class ModelSet:
     def compute_channel_weights(self, model: FittedModel) -> NoiseModel:
         """Return the noise that weights the channels in a score test about a model.
 
-        It is raised to the residual of the model where that is larger, so that a channel that the
-        model does not follow does not dominate.
+        It is the sensor noise, or the residual of the model where that is larger, so that a channel
+        that the model does not follow does not dominate.
         """
         sigma = model.likelihood.sigma
         # A channel without samples has no sigma, and its weight has no influence.

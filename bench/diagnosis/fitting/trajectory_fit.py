@@ -63,21 +63,20 @@ def iterate_rounds(iterations: int, is_racing: bool) -> Iterator[RacingRound]:
     The first round is longer, because in the first steps even the right model may be far behind.
 
     Args:
-        iterations: total number of iterations; with 0, one empty round is generated.
+        iterations: total number of iterations; with 0, one empty round is generated, in which only
+            the starts are simulated.
         is_racing: whether the fits exchange their best cost after each short round, to stop those
             that are far behind; otherwise there is only one round.
     """
+    if not iterations:
+        yield RacingRound(0, 0, 1)
     begin = 0
-    while begin < iterations or not begin:
+    while begin < iterations:
         end = iterations
         if is_racing:
-            end = min(
-                iterations,
-                begin + ITERATIONS_PER_ROUND if begin else MIN_ITERATIONS_BEFORE_ELIMINATION,
-            )
-        yield RacingRound(begin, end, max(iterations, 1))
-        if not iterations:
-            return
+            length = ITERATIONS_PER_ROUND if begin else MIN_ITERATIONS_BEFORE_ELIMINATION
+            end = min(iterations, begin + length)
+        yield RacingRound(begin, end, iterations)
         begin = end
 
 
@@ -492,10 +491,10 @@ class TrajectoryFitter:
         """
         # 1. Displace each unknown of each trial point.
         state_indices = self._list_displaced_states()
-        steps = [fit_state.compute_inward_steps(start.theta) for fit_state, start in trials]
+        all_steps = [fit_state.compute_inward_steps(start.theta) for fit_state, start in trials]
         displaced_inputs = [
-            build_displaced_inputs(start, fit_state.free_indices, step, state_indices)
-            for (fit_state, start), step in zip(trials, steps, strict=True)
+            build_displaced_inputs(start, fit_state.free_indices, steps, state_indices)
+            for (fit_state, start), steps in zip(trials, all_steps, strict=True)
         ]
         # 2. Simulate all of them.
         # Sets of parameters are ordered by model, then by unknown.
@@ -505,12 +504,13 @@ class TrajectoryFitter:
         # 3. Compute differences and costs.
         points = []
         first = 0
-        for (fit_state, start), step in zip(trials, steps, strict=True):
-            # The first element is not displaced; each other one has one unknown displaced.
+        for (fit_state, start), steps in zip(trials, all_steps, strict=True):
+            # The first of the simulations of a point is not displaced; each other one has one
+            # unknown displaced.
             end = first + 1 + fit_state.free_indices.size + state_indices.size
             point_simulations = simulated[first:end]
             first = end
-            jacobian = self._compute_derivatives(point_simulations, step, state_indices)
+            jacobian = self._compute_derivatives(point_simulations, steps, state_indices)
             if self.evaluator.has_linearisation:
                 jacobian[..., fit_state.free_indices.size :] = (
                     self._compute_initial_state_derivatives(
@@ -600,16 +600,18 @@ class TrajectoryFitter:
         known_mask = self.evaluator.known_state_mask
         q = steps.size - known_mask.shape[1]
         columns = np.concatenate([np.arange(q), q + state_indices])
-        # An abandoned batch element is NaN, so the effect of its unknown is not known.
+        # An abandoned batch element is NaN, so the derivative by its unknown is not known, and
+        # zero.
         with np.errstate(all="ignore"):
             quotients = np.moveaxis(simulated[1:] - simulated[0], 0, -1) / steps[columns]
         jacobian: Array = np.where(is_finite_response(quotients), quotients, 0.0)
         if columns.size == steps.size:
             return jacobian
-        quotients, jacobian = jacobian, np.zeros((*simulated.shape[1:], steps.size))
-        jacobian[..., columns] = quotients
-        jacobian[..., q:] *= ~known_mask[:, None, None, :]
-        return jacobian
+        # Some states are not displaced, because they are known in all runs; others in some runs.
+        full_jacobian = np.zeros((*simulated.shape[1:], steps.size))
+        full_jacobian[..., columns] = jacobian
+        full_jacobian[..., q:] *= ~known_mask[:, None, None, :]
+        return full_jacobian
 
     def _move_to_point(self, fit_state: FitState, point: FitPoint) -> None:
         """Move a fit to a point with its derivatives, and adapt the difference steps to them.
@@ -796,15 +798,17 @@ def _can_stick(evaluator: RunEvaluator, names: Sequence[str]) -> bool:
     return any(is_dry_friction(available[part]) for part in parts & available.keys())
 
 
-def _advance_group(evaluator: RunEvaluator, terms: tuple[Any, ...], *call: Any) -> list[FitState]:
+def _advance_group(
+    evaluator: RunEvaluator, fields: tuple[Any, ...], *arguments: Any
+) -> list[FitState]:
     """Advance one group of fits by one racing round; runs in this process or in a worker.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        terms: further fields of `TrajectoryFitter`.
-        *call: arguments of `TrajectoryFitter.advance_round`.
+        fields: further fields of `TrajectoryFitter`, from `_list_worker_arguments`.
+        *arguments: arguments of `TrajectoryFitter.advance_round`.
     """
-    return TrajectoryFitter(evaluator, *terms).advance_round(*call)
+    return TrajectoryFitter(evaluator, *fields).advance_round(*arguments)
 
 
 def compute_state_prior(evaluator: RunEvaluator) -> Array:
@@ -816,15 +820,15 @@ def compute_state_prior(evaluator: RunEvaluator) -> Array:
     Shapes: s states of a run.
 
     Args:
-        evaluator: Run evaluator of the recording.
+        evaluator: run evaluator of the recording.
     """
     if evaluator.state_prior is not None:
         return evaluator.state_prior
     system, recorded_channels = evaluator.simulator.system, set(evaluator.channels)
     # Samples of a coordinate also show its rate; a user-defined system may have further states.
-    pairs = dict(zip(system.rates, system.coordinates, strict=False))
+    coordinates = dict(zip(system.rates, system.coordinates, strict=False))
     is_measured = [
-        name in recorded_channels or pairs.get(name) in recorded_channels
+        name in recorded_channels or coordinates.get(name) in recorded_channels
         for name in evaluator.state_names
     ]
     return np.where(is_measured, OBSERVED_STATE_PRIOR_SIGMA, UNOBSERVED_STATE_PRIOR_SIGMA)

@@ -288,8 +288,10 @@ def _filter_with_fitted_parameters(runs: SimulatedRuns) -> FollowedRuns:
 
     evaluator = runs.fitting
     with runs.record_widened_ranges():
-        # The joints of a real robot have friction, and long recordings are those of real robots.
-        result = identify_base(evaluator, runs.noise, runs.nominal_filter, is_long(evaluator))
+        # Long recordings are those of real robots, whose joints certainly have friction.
+        result = identify_base(
+            evaluator, runs.noise, runs.nominal_filter, is_resisted=is_long(evaluator)
+        )
     if result.parameters is not None:
         runs.context.identified = evaluator.identified = result.parameters
     return result.followed

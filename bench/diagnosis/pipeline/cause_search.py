@@ -117,21 +117,23 @@ class CauseSearch:
         """Refit the base model with MuJoCo's soft dry friction, and search for causes again.
 
         Args:
-            base: Base model, fitted with stiff friction.
-            stiff_search: Search with stiff friction; its results are reused where they are valid.
-            likely: Model that may explain the runs, which is fitted first; None without one.
+            base: base model, fitted with stiff friction.
+            stiff_search: search with stiff friction; its filters are reused where they are valid.
+            likely: model that may explain the runs, which is fitted first; None without one.
         """
         stiff_runs, context = base.runs, base.runs.context
         context.say(SOFT_FRICTION)
-        runs = replace(
-            stiff_runs.with_kind(make_soft_kind(stiff_runs.kind)), before=stiff_runs.before
-        )
+        soft_runs = stiff_runs.with_kind(make_soft_kind(stiff_runs.kind))
+        # The gain on held-out runs refers to the prediction with the settings of the model file.
+        runs = replace(soft_runs, before=stiff_runs.before)
         evaluator, fit = runs.fitting, base.fit
+        # The fit continues with the fitted parameters, but from the initial states of the filter.
         start = replace(fit.fit.make_start(), initial_states=evaluator.initial_state_guesses)
         soft_base = BaseModel(runs, fit.refit(evaluator, runs.noise, start)).correct_step_errors()
         rng = runs.make_rng()
         search = runs.create_search(soft_base.fit, rng)
-        # Friction of the file keeps its form unless it is a free number.
+        # Filters are valid if the base model has no dry friction that changes its form. Friction of
+        # the model file changes it only if it is a free number.
         has_same_base = not has_dry_friction(evaluator, ())
         _take_over(search, stiff_search, likely, has_same_base)
         return self._find_causes(soft_base, search, rng)

@@ -39,13 +39,13 @@ class HeldOutGains:
 
     @cached_property
     def noise_sigma(self) -> Array:
-        """Noise floor (C,).
+        """Noise (C,) of each channel: specified by the recording, or else estimated.
 
-        It is the specified noise, or else the residual of a model without lack of fit.
+        The estimate assumes white noise, and autocorrelated noise exceeds it. So it is replaced by
+        the residual of the found model, if that is larger and has no structure.
         """
         finding, floor = self.result.finding, self.result.runs.floor
         residual_sigma = finding.model.likelihood.sigma
-        # The noise estimate assumes white noise, so the residual of a good model may exceed it.
         is_usable = ~floor.is_stated & np.isfinite(residual_sigma) & (residual_sigma > floor.sigma)
         has_no_structure = not finding.lack_of_fit.has_structure
         return np.where(is_usable & has_no_structure, residual_sigma, floor.sigma)

@@ -75,10 +75,11 @@ class SearchResult:
         return bool(self.errors) or is_stopped or self.runs.context.search_control.is_over()
 
     def list_competing_models(self) -> list[FittedModel]:
-        """Return the models with an alternative in place of the strongest cause that has some.
+        """Return the fitted models with an alternative in place of one of the causes.
 
-        The alternatives explain the data as well, and an experiment should distinguish them. The
-        most plausible one comes first. The list is empty if no cause has alternatives.
+        The alternatives explain the data as well as the cause, and an experiment should distinguish
+        them. The strongest cause with fitted alternatives is replaced; the most plausible
+        alternative comes first. The list is empty if no cause has alternatives.
         """
         for cause in self.finding.causes:
             others = {name for name in self.finding.model.effects if name != cause.effect}

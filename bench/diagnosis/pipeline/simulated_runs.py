@@ -51,7 +51,7 @@ class DiagnosisContext:
     """
 
     def __init__(self, options: ExplainOptions, worker_pool: ForkedWorkerPool) -> None:
-        """Start the clock of the time limit."""
+        """Start the clock of the time limit, without notes and results."""
         self.started = time.perf_counter()
         self.options = options
         self.say = options.say
@@ -257,6 +257,7 @@ class SimulatedRuns:
             use_bounds(evaluator, widened)
         for name, (low, high) in widened.items():
             self.context.say(f"{name} ends at a bound of its range: widened to {low:g} to {high:g}")
+            # The first declared range is kept if a range is widened again.
             declared, _ = self.context.wider.get(name, (bounds_before[name], None))
             self.context.wider[name] = declared, (low, high)
 

@@ -53,23 +53,21 @@ class RatedOptions(NamedTuple):
 
     @classmethod
     def rate(cls, model: BaseModel) -> RatedOptions:
-        """Rate how well a base model explains the fitted runs and predicts the held-out ones.
-
-        The latter is zero without validation.
-        """
+        """Rate how well a base model explains the fitted runs and predicts the held-out ones."""
         search = model.runs.create_search(model.fit)
         rated = search.base_model
+        # Without validation, held-out runs count as equally likely.
         held_out = 0.0
         if model.runs.validation is not None:
             (prediction,) = model.runs.validation.validate([model.fit.fit])
             held_out = prediction.penalised_log_likelihood
         return cls(
-            model,
-            float(rated.likelihood.value),
-            rated.penalised_log_likelihood,
-            1.0 + search.compute_excess_residual(rated),
-            held_out,
-            search.is_noise_like(rated),
+            model=model,
+            log_likelihood=float(rated.likelihood.value),
+            penalised_log_likelihood=rated.penalised_log_likelihood,
+            residual=1.0 + search.compute_excess_residual(rated),
+            held_out=held_out,
+            is_noise_like=search.is_noise_like(rated),
         )
 
     def is_better_than(self, other: RatedOptions) -> bool:
@@ -146,13 +144,14 @@ class SolverOptionChoice:
         options = self._possible_options
         if options is None or result.has_ended:
             return result
-        merit = result.rate()
-        option_merit = options.penalised_log_likelihood, options.residual - 1.0
-        if not is_finer_model_better(merit, option_merit) and result.is_explained:
+        # Ratings are the penalised log-likelihood and the excess residual.
+        rating = result.rate()
+        option_rating = options.penalised_log_likelihood, options.residual - 1.0
+        if not is_finer_model_better(rating, option_rating) and result.is_explained:
             return result
         model = self._use(options, RatedOptions.rate(result.base))
         other = cause_search.search(model.finish())
-        if is_finer_model_better(merit, other.rate()):
+        if is_finer_model_better(rating, other.rate()):
             return other
         self.finding = None
         return result
@@ -181,7 +180,7 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
     the base model is fitted with the best few.
 
     Args:
-        rated: The options of the model file.
+        rated: base model with the options of the model file, and its rating.
     """
     # This import is needed for robots only.
     from bench.diagnosis.evaluation.solver_option_ranking import rank_option_alternatives

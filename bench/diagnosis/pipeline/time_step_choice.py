@@ -110,8 +110,8 @@ class TimeStepChoice:
             return result
         # 1. Step of the file.
         if self._file_runs is not None:
-            file_merit = _rate_best_subset(self._file_runs, result)
-            if is_finer_model_better(file_merit, result.rate()):
+            file_rating = _rate_best_subset(self._file_runs, result)
+            if is_finer_model_better(file_rating, result.rate()):
                 return result
             model.runs.context.say(
                 "the time step of the model file explains the data equally well: it is used"
@@ -125,10 +125,10 @@ class TimeStepChoice:
         if refinement is None or finding.is_incomplete:
             return result
         runs = model.runs.with_kind(refinement.kind)
-        merit, finer_merit = result.rate(), _rate_best_subset(runs, result)
-        if not is_finer_model_better(merit, finer_merit):
+        rating, finer_rating = result.rate(), _rate_best_subset(runs, result)
+        if not is_finer_model_better(rating, finer_rating):
             return result
-        (log_likelihood, _), (finer_log_likelihood, _) = merit, finer_merit
+        (log_likelihood, _), (finer_log_likelihood, _) = rating, finer_rating
         gain = finer_log_likelihood - log_likelihood
         finer = self._use(refinement, gain, model, model.refit(runs))
         return cause_search.search(finer.finish())

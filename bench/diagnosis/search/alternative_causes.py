@@ -35,7 +35,7 @@ from bench.diagnosis.search.verdict_rules import (
 )
 
 MAX_COMPETITOR_DISTANCE = 30.0
-"""Maximum difference in twice the log-likelihood (merit) of competing models that are refitted."""
+"""Maximum difference in penalised log-likelihood of competing models that are refitted."""
 MAX_COMPETITOR_EXCESS_RATIO = 1.5
 """Maximum excess of refitted competing models, as a multiple of the excess of the model."""
 
@@ -299,7 +299,8 @@ class AlternativeFinder:
 
         The gain is the increase of twice the log-likelihood over the model without the effect. An
         alternative is an effect that, in place of this one, explains the data equally well. Of
-        these, the one with the most plausible coefficients is preferred.
+        these and the effect itself, the one with the most plausible coefficients is preferred,
+        unless the residual has structure.
         """
         reduced_model = self._get_model_without(model, effect)
         gain = model.likelihood.value - reduced_model.likelihood.value
@@ -313,9 +314,8 @@ class AlternativeFinder:
         alternatives = tuple(name for name in ordered_effects if name != effect)
         # With structure in the residual, indistinguishable does not mean equally likely, so the
         # effect found is kept.
-        preferred_effect = (
-            effect if self.structure and effect in ordered_effects else ordered_effects[0]
-        )
+        is_kept = self.structure and effect in ordered_effects
+        preferred_effect = effect if is_kept else ordered_effects[0]
         return CauseEvidence(
             effect=effect,
             alternatives=alternatives,

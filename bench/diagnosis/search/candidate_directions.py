@@ -243,7 +243,9 @@ def _is_contained_in_model(
 ) -> bool:
     """Return whether the model already has a simpler effect that the effect `name` contains.
 
-    The simpler effect may also be in the model as a member of a family (one effect at all places).
+    An effect contains another one if it acts like it at some values of its coefficients, as
+    Stribeck friction contains Coulomb friction. The simpler effect may also be in the model as a
+    member of a family (one effect at all places).
 
     Args:
         evaluator: the runs, with all available effects.
@@ -504,7 +506,7 @@ def _iterate_grid_points(
     parameters = list_coefficients(evaluator, first.effect)
     points = product(MODIFIER_SHARES, repeat=len(modifiers))
     for grid_point, modifier_shares in enumerate(points, start=1):
-        # All modifiers at zero give the effect that was already tried.
+        # All modifiers at zero give the effect that was already tried, as grid point 0.
         if not any(modifier_shares):
             continue
         grid_coefficients = first.coefficients.copy()
@@ -590,6 +592,7 @@ def simulate_with_effect(
         Observations (K, R, T, C).
     """
     run_count = len(evaluator.prepared_runs)
+    # One row of parameters for each effect.
     theta = np.tile(fit.theta, (len(added), 1))
     for row, (name, coefficients) in zip(theta, added, strict=True):
         row[evaluator.coefficient_slices[name]] = coefficients

@@ -384,8 +384,9 @@ def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array)
     if smoothed is None:
         return
     rng = search.make_rng("initial states")
+    # No coefficients are varied.
     best_sample = RandomSearch(runs, sigma, smoothed, rng).run(
-        theta, [], np.zeros(0), np.zeros((0, 2))
+        theta, indices=[], widths=np.zeros(0), bounds=np.zeros((0, 2))
     )
     if best_sample.mean_square * sample_count < before:
         runs.begin_at(best_sample.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
@@ -497,12 +498,12 @@ def _rank_effects_at_contacts(search: EffectSearch, base: FittedModel) -> list[_
     scanned_values = _scan_effects_at_contacts(search, base.fit.initial_states)
     if not scanned_values:
         return []
-    unchanged = _scan(
+    # With the coefficient zero, any effect is off.
+    without_effect = _scan(
         search, scanned_values[0]._replace(coefficient=0.0), 0.0, base.fit.initial_states
     )
-    useful = [
-        value for value in scanned_values if value.squares < MAX_SCAN_RATIO * unchanged.squares
-    ]
+    limit = MAX_SCAN_RATIO * without_effect.squares
+    useful = [value for value in scanned_values if value.squares < limit]
     return sorted(useful, key=lambda value: value.squares)[:MAX_TRIED_EFFECTS]
 
 

@@ -223,7 +223,7 @@ class Inquiry:
         # Unfinished fits of initial states would be held against their model.
         self._search_control.check_not_stopped()
         self._held_out_validation = validation
-        # The effects that remain after dropping an idle one may have simpler forms.
+        # The effects that remain after dropping an unhelpful one may have simpler forms.
         self._model = self._search.simplify_laws(
             validation.drop_unhelpful_effects(self._search, self._model)
         )

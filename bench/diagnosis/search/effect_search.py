@@ -50,9 +50,12 @@ MAX_EFFECTS_ON_SEGMENTS = 2
 SEGMENT_MODELS_KEPT = 5
 """Number of best models on short segments that are fitted to the whole runs."""
 STEP_CORRECTION_REFIT_DISTANCE = 100.0
-"""Maximum distance in merit of models that are refitted after a discretisation correction."""
+"""Maximum distance of models that are refitted after a discretisation correction.
+
+It is a difference in penalised log-likelihood.
+"""
 BEAM_WIDTH = 3
-"""Maximum number of models with the highest merit that are extended."""
+"""Maximum number of models with the highest penalised log-likelihood that are extended."""
 BEAM_WIDTH_BY_SQUARES = 2
 """Number of models with the lowest sum of squares that are extended in addition."""
 MIN_RELATIVE_GAIN_IN_BEAM = 0.5
@@ -67,7 +70,7 @@ MAX_RICHER_LAW_EXCESS_RATIO = 0.95
 Above this share, the simpler law is used instead.
 """
 MIN_SCORE_GAIN = 1e-6
-"""Minimum gain in merit of an exchange; smaller gains are rounding."""
+"""Minimum gain in penalised log-likelihood of an exchange; smaller gains are rounding."""
 
 EffectStarts = dict[str, Array]
 """Effects with their initial coefficients."""
@@ -108,7 +111,7 @@ class EffectSearch(ScoredModelSet):
         2. Fit models with one more effect.
         3. Accept the best of them if its gain is significant.
         4. Otherwise continue only far from the noise: if two effects explain the data only
-           together, neither has much merit alone.
+           together, neither gains much alone.
         5. Stop if the larger model is still far from the data.
         """
         best = self.base_model
@@ -184,8 +187,8 @@ class EffectSearch(ScoredModelSet):
     def get_best_so_far(self) -> FittedModel:
         """Return the best supported model of a search that has to end now, without any simulation.
 
-        A larger fitted model replaces the present one if its gain is significant by the known
-        scores.
+        The best larger fitted model replaces the present one if its penalised log-likelihood is
+        higher and its gain is significant by the known scores.
         """
         best = self.models[frozenset((self.best_supported_model or self.base_model).effects)]
         larger = [m for m in self.models.values() if len(m.effects) > len(best.effects)]
@@ -222,7 +225,8 @@ class EffectSearch(ScoredModelSet):
             return None
         if size == 1:
             return self.simplify_laws(self._choose_simpler_effect(larger))
-        # An idle effect is dropped before the exchange, which would replace it by another idle one.
+        # An unneeded effect is dropped before the exchange, which would only replace it by another
+        # unneeded one.
         larger = self.swap_effect(self.drop_unneeded_effects(larger))
         larger = self.drop_unneeded_effects(larger)
         return self.simplify_laws(select_conservative_model(self, best, larger))
@@ -270,13 +274,12 @@ class EffectSearch(ScoredModelSet):
     ) -> Sequence[Sequence[FittedModel]]:
         """Return groups of models to extend together.
 
-        If simulations are expensive, models are extended one by one until the data are explained.
+        For a robot, whose simulations are expensive, models are extended one by one until the data
+        are explained; otherwise all of them together.
         """
-        return (
-            [[competing_model] for competing_model in competing_models]
-            if self.evaluator.has_linearisation
-            else [competing_models]
-        )
+        if self.evaluator.has_linearisation:
+            return [[competing_model] for competing_model in competing_models]
+        return [competing_models]
 
     def refit_from_segments(self, size: int) -> None:
         """Search on short segments of the runs, and refit the best models to whole runs.
@@ -290,7 +293,8 @@ class EffectSearch(ScoredModelSet):
         segment_evaluator = make_segment_evaluator(self.evaluator)
         if segment_evaluator is None:
             return
-        # One search on segments serves every size; it decides nothing, and only provides starts.
+        # One search on segments serves every size, beginning with the base model; it decides
+        # nothing, and only provides starts.
         if self._segment_search is None:
             self._segment_search = EffectSearch(
                 segment_evaluator,
@@ -302,7 +306,6 @@ class EffectSearch(ScoredModelSet):
             self._segment_search.refit_models(
                 [FitStart((), self.base_model.fit.theta, segment_evaluator.initial_state_guesses)]
             )
-        # Search on segments, then refit its best models to whole runs.
         segment_search = self._segment_search
         segment_search.refit_extensions(
             select_beam(segment_search, size - 1), MAX_REFITTED_CANDIDATES
@@ -335,8 +338,9 @@ class EffectSearch(ScoredModelSet):
         """Return the model of a simpler effect in place of a single effect, if it is preferable.
 
         A simpler effect is one that the effect contains, as Stribeck friction contains Coulomb
-        friction. It is preferred if the residual has structure to which the richer effect may have
-        adapted, and the richer one does not clearly leave less.
+        friction. It is preferred if something is still missing, to which the richer effect may have
+        adapted, and the richer one does not at least halve the excess residual (RMS residual in
+        units of the noise, minus one).
 
         Args:
             single: fitted model with one effect; it is returned if no simpler one is preferable.
@@ -345,8 +349,6 @@ class EffectSearch(ScoredModelSet):
             return single
         for name in self.evaluator.available_effects[single.effects[0]].contains:
             simpler_model = self.models.get(frozenset([name]))
-            # The richer effect must reduce the excess clearly, otherwise it mimics a missing
-            # effect.
             if simpler_model is not None and self.compute_excess_residual(
                 single
             ) > MAX_REPLACEMENT_EXCESS_SHARE * self.compute_excess_residual(simpler_model):
@@ -602,7 +604,8 @@ def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:
     )
     excess = search.compute_excess_residual(larger)
     if search.thorough:
-        # The model to extend need not have the lowest excess, because merit is misleading there.
+        # The model to extend need not have the lowest excess, because likelihoods are misleading
+        # there.
         excess = min(excess, *_list_excess_residuals(search, len(larger.effects)))
     return excess > min(limit_by_base, limit_by_single)
 

@@ -88,17 +88,17 @@ class HeldOutValidation:
         """
         while model.effects and model.effects in self.held_out_fits:
             submodels = self._list_smaller_models(search, model)
-            models_without_idle_effect = [
+            better_submodels = [
                 smaller_model
                 for smaller_model in submodels
                 if not self._improves_prediction(search, smaller_model, model)
             ]
-            if not models_without_idle_effect:
+            if not better_submodels:
                 return model
-            # If several effects are idle, drop the one without which held-out runs are predicted
+            # If several effects do not help, drop the one without which held-out runs are predicted
             # best.
             model = max(
-                models_without_idle_effect,
+                better_submodels,
                 key=lambda smaller_model: (
                     self.held_out_fits[smaller_model.effects].penalised_log_likelihood
                 ),
@@ -234,11 +234,12 @@ class HeldOutValidation:
             model: the model, which has been evaluated.
             lack_of_fit: lack-of-fit test of the model: p-value and description.
         """
-        residual_sigma = np.nan_to_num(model.likelihood.sigma)
-        # The residual of fitted runs is noise if it has no structure; otherwise only the noise
-        # floor is.
-        known_noise = np.where(lack_of_fit.has_structure, 0.0, residual_sigma)
-        noise = np.maximum(self.runs.noise.sigma, known_noise)
+        noise = self.runs.noise.sigma
+        # The residual of the fitted runs is noise if it has no structure. A channel without samples
+        # has none.
+        if not lack_of_fit.has_structure:
+            noise = np.maximum(noise, np.nan_to_num(model.likelihood.sigma))
+        # The base model has no effects.
         before = self.compute_excess_residual((), noise)
         after = self.compute_excess_residual(model.effects, noise)
         return misses_held_out_gap(before, after)

@@ -86,11 +86,12 @@ class GroupBatch:
 def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
     """Group the directions that can only be scored together.
 
-    These are the directions of one effect at one choice of its shape parameters (a grid point),
-    such as the sine and the cosine of a ripple of one frequency.
+    A direction is the response of the runs to one coefficient of an effect. A group has those of
+    one effect at one choice of its shape parameters (a grid point), such as the sine and the cosine
+    of a ripple of one frequency.
 
     Args:
-        directions: Directions of all candidate effects.
+        directions: directions of all candidate effects.
     """
     columns_by_grid_point: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(directions.candidates):
@@ -253,7 +254,8 @@ def _solve_subset(gram: Array, cross: Array, subset: list[int]) -> _SubsetSoluti
 def _solve_unconstrained(gram: Array, cross: Array) -> tuple[Array, Array]:
     """Solve G c = h with all columns by eigenvalues, without sign constraints.
 
-    It is used for groups with too many columns to try all subsets.
+    It is used for groups with too many columns to try all subsets. Components with very small
+    eigenvalues are left out (pseudoinverse).
 
     Args:
         gram: (n, k, k) inner products G = <D, D> of the k directions of each of n groups.
@@ -262,18 +264,20 @@ def _solve_unconstrained(gram: Array, cross: Array) -> tuple[Array, Array]:
     Returns:
         The explained sums of squares (n, S), and the coefficients (n, k) for the first residual.
     """
-    # Some of many columns nearly repeat others, as overlapping basis functions do; their
-    # contribution is rounding.
-    powers = np.diagonal(gram, axis1=1, axis2=2)
-    scale = np.sqrt(np.maximum(powers, 1e-300))[:, :, None]
-    values, vectors = np.linalg.eigh(gram / scale / scale.transpose(0, 2, 1))
-    is_counted = values > RANK_TOLERANCE * values[:, -1:]
-    weights = np.where(is_counted, 1.0 / np.where(is_counted, values, 1.0), 0.0)
+    # Of many columns, some nearly repeat others, as overlapping basis functions do. What they add
+    # is rounding.
+    squared_lengths = np.diagonal(gram, axis1=1, axis2=2)
+    scale = np.sqrt(np.maximum(squared_lengths, 1e-300))[:, :, None]
+    # Eigenvalues (n, k) in ascending order, and eigenvectors of G with columns of unit length.
+    eigenvalues, eigenvectors = np.linalg.eigh(gram / scale / scale.transpose(0, 2, 1))
+    is_counted = eigenvalues > RANK_TOLERANCE * eigenvalues[:, -1:]
+    inverses = np.where(is_counted, 1.0 / np.where(is_counted, eigenvalues, 1.0), 0.0)
     # In the eigenbasis G is diagonal, so h'G^-1 h is a sum with one term for each eigenvector.
-    right_hand_side = vectors.transpose(0, 2, 1) @ (cross / scale)
-    scaled_coefficients = weights[:, :, None] * right_hand_side
-    gain: Array = np.einsum("nks,nks->ns", right_hand_side, scaled_coefficients)
-    coefficients = (vectors @ scaled_coefficients[:, :, :1]) / scale
+    right_hand_side = eigenvectors.transpose(0, 2, 1) @ (cross / scale)
+    solution = inverses[:, :, None] * right_hand_side
+    gain: Array = np.einsum("nks,nks->ns", right_hand_side, solution)
+    # For the first residual, in the original columns and their units.
+    coefficients = (eigenvectors @ solution[:, :, :1]) / scale
     return gain, coefficients[:, :, 0]
 
 
@@ -360,7 +364,7 @@ class ScoreTest:
         """Subtract from residuals (S, R, T, C) what parameters and initial states can absorb.
 
         The real residual is what a fit leaves, so it contains no such component. Surrogate
-        residuals are comparable with it only after this projection.
+        residuals (random noise) are comparable with it only after this projection.
         """
         return self._design.project_out(residuals)
 

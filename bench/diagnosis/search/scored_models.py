@@ -242,16 +242,16 @@ class ScoredModelSet(ModelSet):
     def _limit_cache_size(self, kept_keys: Sequence[frozenset[str]]) -> None:
         """Remove the oldest stored directions until they fit in `DIRECTION_CACHE_BYTES`.
 
-        Directions of the base model (the empty key) and of the models `kept_keys` are never
-        removed, because they are needed next.
+        Directions are the responses of the runs to all effects that a model lacks, and take much
+        memory. Those of the base model (the empty key) and of the models `kept_keys` are needed
+        next; they are never removed, and those of the base model are not counted.
         """
+        # Directions about replaced fits are removed first.
         for cache in (self.superseded_scans, self.cached_scans):
             for key in [k for k in cache if k and k not in kept_keys]:
                 cached_entries = [*self.superseded_scans.items(), *self.cached_scans.items()]
-                if (
-                    sum(scan.directions.responses.nbytes for k, scan in cached_entries if k)
-                    <= DIRECTION_CACHE_BYTES
-                ):
+                size = sum(scan.directions.responses.nbytes for k, scan in cached_entries if k)
+                if size <= DIRECTION_CACHE_BYTES:
                     return
                 del cache[key]
 
@@ -265,8 +265,8 @@ class ScoredModelSet(ModelSet):
     def enter_scores(self, key: frozenset[str], scores: CandidateScores) -> None:
         """Store the scores about a model.
 
-        Those about the base model also give the null-hypothesis level of each effect, which
-        penalises the likelihood of all models with this effect.
+        Those about the base model also give what each effect gains from noise alone (90 % quantile
+        of its score over surrogates). It penalises the likelihood of all models with this effect.
 
         Args:
             key: effects of the model.
@@ -274,7 +274,8 @@ class ScoredModelSet(ModelSet):
         """
         self.scores_by_effects[key] = scores
         self.best_p_values[key] = scores.p_value
-        # Kept from the first scan, so that merits remain comparable after a better base fit.
+        # Kept from the first scores, so that models fitted before and after a better base fit can
+        # be compared.
         if not key and not self.null_gains:
             self.null_gains = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
 
@@ -294,8 +295,8 @@ class ScoredModelSet(ModelSet):
     def _list_addable_effects(self, model: FittedModel) -> list[str]:
         """Return the effects that could be added to a model.
 
-        These are all effects of the library that are neither in the model nor contained in one of
-        its effects.
+        These are all effects of the library, except those in the model, those that one of its
+        effects contains, and those that the search excludes (`excluded_effects`).
         """
         included_effects = {*model.effects, *self.excluded_effects}
         # An effect and one that it contains have no unique solution together.
@@ -394,10 +395,13 @@ class ScoredModelSet(ModelSet):
         return self.evaluator.has_linearisation and likelihood_deficit > NESTED_MODEL_TOLERANCE
 
     def _list_simpler_models(self, start: FitStart) -> set[frozenset[str]]:
-        """Return the models in which one effect is replaced by a simpler one it contains.
+        """Return the models in which one effect of a start is replaced by a simpler one.
 
-        If such a model already leaves only noise, the start need not be fitted. Each model is the
-        set of its effects.
+        The effect contains the simpler one. If such a model already leaves only noise, the start
+        need not be fitted.
+
+        Returns:
+            The models, each as the set of its effects.
         """
         effect_names = frozenset(start.effects)
         effects = self.evaluator.available_effects
@@ -519,6 +523,9 @@ def _scan_model(
 ) -> ModelScan:
     """Simulate the directions of all effects that a model lacks, and score them; runs in a worker.
 
+    A direction is the response of the runs to an effect, and a score the gain in likelihood that it
+    predicts.
+
     Shapes: R runs, T samples, C channels.
 
     Args:
@@ -530,11 +537,11 @@ def _scan_model(
         observed_mask: (R, T, C) mask of available samples.
         rng: random generator of the surrogates.
     """
-    candidates = compute_directions(evaluator, fit, missing_effects)
-    test = ScoreTest(fit, candidates, observed_mask, weights)
-    return ModelScan(
-        fit, candidates, test, _score_residual(test, residual, residual, observed_mask, rng)
-    )
+    directions = compute_directions(evaluator, fit, missing_effects)
+    test = ScoreTest(fit, directions, observed_mask, weights)
+    # Surrogates have the spectrum of the residual itself.
+    scores = _score_residual(test, residual, residual, observed_mask, rng)
+    return ModelScan(fit, directions, test, scores)
 
 
 def _score_residual(

@@ -238,6 +238,7 @@ def _collect_full_fit_starts(
         *select_decisive(subsampled_search, subsampled_model, competing_models),
         *list_submodels(subsampled_search, subsampled_model),
     ]
+    # Models without one of the effects that were not fitted yet are fitted now.
     selected_models += [
         subsampled_search.remove_effect(subsampled_model, name) for name in subsampled_model.effects
     ]

@@ -127,24 +127,22 @@ def exceeds_noise(excess: float, error: float, is_noise_stated: bool) -> bool:
         is_noise_stated: whether the recording specifies the noise; an estimated floor assumes white
             noise and may be several times too small.
     """
-    return excess > (
-        1.0 + NOISE_TOLERANCE + EXCESS_STANDARD_ERRORS * error
-        if is_noise_stated
-        else MAX_AUTOCORRELATED_NOISE_RATIO
-    )
+    if is_noise_stated:
+        return excess > 1.0 + NOISE_TOLERANCE + EXCESS_STANDARD_ERRORS * error
+    return excess > MAX_AUTOCORRELATED_NOISE_RATIO
 
 
 def get_structure_threshold(is_noise_stated: bool) -> float:
     """Return the p-value threshold of the lack-of-fit test.
 
+    It is lower if noise is estimated, because such noise may be autocorrelated.
+
     Args:
         is_noise_stated: whether the noise of all channels is specified.
     """
-    return (
-        STRUCTURE_P_VALUE_THRESHOLD
-        if is_noise_stated
-        else STRUCTURE_P_VALUE_THRESHOLD_ESTIMATED_NOISE
-    )
+    if is_noise_stated:
+        return STRUCTURE_P_VALUE_THRESHOLD
+    return STRUCTURE_P_VALUE_THRESHOLD_ESTIMATED_NOISE
 
 
 def has_structure(p_value: float, level: float, channels_above_noise: Sequence[str]) -> bool:
