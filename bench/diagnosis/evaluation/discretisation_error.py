@@ -263,13 +263,13 @@ def correct_discretisation(
     The correction is stored in the evaluator, which adds it to its simulations. An error below
     `MAX_CORRECTABLE_ERROR` is not reported as a cause, but an effect could imitate it: for example
     dry friction that stops within a step and not at its end, or a servo that is nearly too fast for
-    the step. A larger error is not corrected. With the motion q(h) at step size h, the
-    discretisation error is
+    the step. A larger error is not corrected.
 
-        2 q(h / 4) - q(h / 2) - q(h)                                                           (2)
+    With the motion q(h) at step size h, the converged motion is 2 q(h / 4) - q(h / 2) to first
+    order in h (L. F. Richardson, 1911, doi:10.1098/rsta.1911.0009), and approximately for any
+    higher order. The correction is its difference from the simulated motion,
 
-    to first order in h (L. F. Richardson, 1911, doi:10.1098/rsta.1911.0009), and approximately for
-    any higher order.
+        2 q(h / 4) - q(h / 2) - q(h).                                                          (2)
 
     Shapes: R runs, P parameters.
 
@@ -289,13 +289,14 @@ def correct_discretisation(
     initial_states = dict(zip(evaluator.state_names, states.T, strict=True))
     half_step_kind = evaluator.kind.with_half_step()
     # Motions with the usual step, half of it and a quarter of it.
-    simulated = [evaluator.simulator.simulate_batch(thetas, scenarios, initial_states)]
+    motions = [evaluator.simulator.simulate_batch(thetas, scenarios, initial_states)]
     for kind in (half_step_kind, half_step_kind.with_half_step()):
         finer = kind(evaluator.recording.constants, evaluator.channels, effects=effects)
-        simulated.append(finer.simulate_batch(thetas, scenarios, initial_states))
+        motions.append(finer.simulate_batch(thetas, scenarios, initial_states))
+    usual_step, half_step, quarter_step = motions
     # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
     evaluator.simulation_count += 7 * run_count
-    correction = 2.0 * simulated[2] - simulated[1] - simulated[0]  # (2)
+    correction = 2.0 * quarter_step - half_step - usual_step  # (2)
     squared_errors = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]
     if float(np.sqrt(squared_errors.mean())) < MAX_CORRECTABLE_ERROR:
         evaluator.discretisation_correction = np.nan_to_num(correction)

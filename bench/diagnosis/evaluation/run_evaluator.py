@@ -137,8 +137,8 @@ class RunEvaluator:
     ) -> None:
         """Build the simulator with all observable effects, and prepare the runs as padded arrays.
 
-        An effect is included if the recorded channels and inputs can show it. Class attributes are
-        described in the docstring of the class.
+        An effect is included if the recorded channels and inputs can show it. The docstring of the
+        class describes the attributes.
 
         Args:
             kind: class of the simulator.
@@ -156,7 +156,8 @@ class RunEvaluator:
         self.extra_effects = tuple(extra)
         applicable_effects = library.list_effects_for(kind.system)
         recorded_signals = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
-        # An effect on a channel that is not recorded is not observable.
+        # An effect on a channel that is not recorded is not observable. Effects with hidden states,
+        # such as backlash, need an engine that integrates these.
         observable_effects = [
             name
             for name, effect in applicable_effects.items()

@@ -156,9 +156,9 @@ def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) 
         observed_mask: (R, T) mask of available samples.
     """
     order = weights.size
-    count, *shape = projected_pilots.shape
+    count, _, length = projected_pilots.shape
     covariances = _estimate_autocovariances(
-        projected_pilots.reshape(-1, shape[1]), np.tile(observed_mask, (count, 1)), order
+        projected_pilots.reshape(-1, length), np.tile(observed_mask, (count, 1)), order
     )
     estimated_weights, _ = _solve_yule_walker(covariances, order)
     # If no autoregression of this order is found, the bias is unknown.
@@ -214,11 +214,9 @@ def _fit_autoregression(values: Array, observed_mask: Mask) -> Array:
         filled, observed_mask, min(MAX_ORDER, observed_mask.shape[1] - 1)
     )
     weights = _select_order_by_aic(covariances, int(observed_mask.sum()))
-    return (
-        weights
-        if _compute_innovations(filled, observed_mask, weights).size >= MIN_INNOVATIONS
-        else np.zeros(0)
-    )
+    if _compute_innovations(filled, observed_mask, weights).size < MIN_INNOVATIONS:
+        return np.zeros(0)
+    return weights
 
 
 def _compute_centred_innovations(filled: Array, observed_mask: Mask, weights: Array) -> Array:

@@ -164,12 +164,13 @@ class HeldOutGains:
             share = self.get_closed_share(names)
             if len(names) != 1 or share is None or share <= MIN_REPORTED_GAIN:
                 continue
+            (effect,) = names
             # Each effect has its own random stream, so that its interval does not depend on the
             # others.
-            rng = make_rng("held-out share", *names)
+            rng = make_rng("held-out share", effect)
             result = self._compute_gain(runs, before, held_out_fit.simulated, rng)
             if np.isfinite(result.low) and np.isfinite(result.high):
-                intervals[names[0]] = result.low, result.high
+                intervals[effect] = result.low, result.high
         return intervals
 
 

@@ -105,7 +105,8 @@ class TimeStepChoice:
         finding, model = result.finding, result.searched_base
         if self._refinements is None or result.has_ended:
             return result
-        # Without causes, no effect can imitate the error of a step.
+        # Without causes, the comparison of `choose` stands, unless something is unexplained with
+        # the file's step.
         if not finding.causes and (self.finding is not None or finding.verdict == "adequate"):
             return result
         # 1. Step of the file.

@@ -136,8 +136,8 @@ def _list_candidates(search: EffectSearch, gains: HeldOutGains) -> tuple[Candida
             np.clip(estimate_tail_p_value(scores.null_scores, score_above_null), 0.0, 1.0)
         )
         share = gains.get_closed_share((effect,))
-        coefficient_slice = search.evaluator.coefficient_slices[effect]
-        score -= search.parameter_penalty * (coefficient_slice.stop - coefficient_slice.start - 1)
+        coefficient_count = len(search.evaluator.get_coefficient_indices(effect))
+        score -= search.parameter_penalty * (coefficient_count - 1)
         candidates.append(Candidate(effect, max(score, 0.0), p_value, share))
     return tuple(sorted(candidates, key=lambda candidate: -candidate.score))
 

@@ -166,6 +166,8 @@ def iterate_first_probes(
     # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
     shape_indices = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
     travel = evaluator.get_effect_travel(name)
+    # The inertia of a rotor that the model has as an effect already is taken over from it, so only
+    # the smallest value is tried.
     grids = [
         parameters[i].bounds[:1]
         if coefficients[i].of == "rotor" and _is_contained_in_model(evaluator, model_effects, name)

@@ -129,6 +129,8 @@ def propose_contact_effects(search: EffectSearch, evaluators: Sequence[RunEvalua
             # 3. Initial states of all runs.
             _use_first_states_of(search, evaluators, best)
     except SearchStoppedError:
+        # Fits about other initial states begin without any model, but a search needs its base
+        # model.
         search.models.setdefault(frozenset(), base)
         raise
 

@@ -270,9 +270,7 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     )
     score_excess = scores.score - scores.null_quantiles
     best_force = scores.effects[int(np.argmax(score_excess))]
-    return LackOfFitResult(
-        scores.p_value, best_force, size_result.excess, size_result.channels_above_noise, level
-    )
+    return replace(size_result, p_value=scores.p_value, where=best_force, p_value_threshold=level)
 
 
 def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResult:

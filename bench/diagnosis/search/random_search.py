@@ -181,6 +181,7 @@ class RandomSearch:
         shape = (len(samples), STATE_SAMPLES, mean.size)
         spread = compute_root(self._covariances[run][None])[0]
         deviates = self._deviates[run] + self._rng.standard_normal(shape) @ spread.T
+        # The first one is the best so far.
         deviates[:, 0] = self._deviates[run]
         states = np.where(
             self._evaluator.known_state_mask[run],

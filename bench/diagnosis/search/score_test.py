@@ -248,7 +248,13 @@ def _solve_subset(gram: Array, cross: Array, subset: list[int]) -> _SubsetSoluti
     # diagonals.
     scaled = np.linalg.inv(normal[has_full_rank]) @ right_hand_side
     gain = np.einsum("nks,nks->ns", scaled, right_hand_side)
-    return _SubsetSolution(solvable, gain, scaled, scaled[:, :, 0] / scale[:, :, 0])
+    return _SubsetSolution(
+        groups=solvable,
+        gain=gain,
+        scaled=scaled,
+        # For the first residual, in the units of the columns.
+        coefficients=scaled[:, :, 0] / scale[:, :, 0],
+    )
 
 
 def _solve_unconstrained(gram: Array, cross: Array) -> tuple[Array, Array]:

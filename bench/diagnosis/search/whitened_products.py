@@ -429,8 +429,7 @@ class WhiteningDesign:
         The design has the derivatives by parameters and initial states (J) and the directions of
         effects. The products of two columns become a'b - (L'J'a)'(L'J'b), eq. (2), with L L' =
         (J'J)^-1. So only the part of a direction that parameters and initial states cannot absorb
-        remains. `normal` has the products J'J (R, q + s, q + s), and `mixed` those of J with the K
-        directions (R, q + s, K).
+        remains.
 
         1. Whiten all products with phi.
         2. Project out the initial states of each run, then the parameters of all runs.
@@ -439,9 +438,11 @@ class WhiteningDesign:
         """
         parameter_count = self._parameter_count
         # 1. Whitening.
+        # Products J'J (R, q + s, q + s), those of J with the K directions (R, q + s, K), and the
+        # sums of squares of the directions (K,).
         normal = self._jacobian_products.combine(phi)
         mixed = self._direction_products.combine(phi)
-        powers = self._direction_squares.combine(phi)
+        squares = self._direction_squares.combine(phi)
 
         # 2. Projection: L'J'a of the initial states, then of the parameters.
         state_root = _compute_matrix_root(normal[:, parameter_count:, parameter_count:])
@@ -463,12 +464,13 @@ class WhiteningDesign:
         # 3. Absorbed directions.
         # Only rounding remains of absorbed directions, which would explain residuals at random.
         absorbed = np.concatenate([by_directions, by_own_parameters])
-        remaining = powers - np.einsum("ak,ak->k", absorbed, absorbed)
-        acting = remaining > MIN_RESIDUAL_SHARE * powers
+        remaining = squares - np.einsum("ak,ak->k", absorbed, absorbed)
+        acting = remaining > MIN_RESIDUAL_SHARE * squares
         remaining = np.where(acting, remaining, 0.0)
         # 4. Blocks.
         grams = []
         for block, block_sums in zip(self.blocks, self._block_products, strict=True):
+            # A single direction has only its square.
             if block.shape[1] == 1:
                 grams.append(remaining[block][:, :, None])
                 continue
@@ -581,18 +583,18 @@ def _compute_matrix_root(normal: Array) -> Array:
     decides, are omitted.
 
     Args:
-        normal: Matrices J'J of the normal equations.
+        normal: (..., s, s) matrices J'J of the normal equations.
     """
     if not normal.shape[-1]:
         return normal
     # Scale the columns to unit length, so that the cutoff does not depend on their units.
-    powers = np.diagonal(normal, axis1=-2, axis2=-1)
-    scale = np.sqrt(np.maximum(powers, 0.0))
+    squared_lengths = np.diagonal(normal, axis1=-2, axis2=-1)
+    lengths = np.sqrt(np.maximum(squared_lengths, 0.0))
     # A row of zeros remains zero, because it is divided by infinity.
-    scale = np.where(scale > 0, scale, np.inf)[..., None]
-    values, vectors = np.linalg.eigh(normal / scale / np.swapaxes(scale, -1, -2))
-    largest = np.maximum(values[..., -1:], 1e-300)
-    is_counted = values > RANK_TOLERANCE * largest
-    root = np.where(is_counted, 1.0 / np.sqrt(np.where(is_counted, values, 1.0)), 0.0)
-    result: Array = vectors * root[..., None, :] / scale
-    return result
+    scale = np.where(lengths > 0, lengths, np.inf)[..., None]
+    eigenvalues, eigenvectors = np.linalg.eigh(normal / scale / np.swapaxes(scale, -1, -2))
+    largest = np.maximum(eigenvalues[..., -1:], 1e-300)
+    is_counted = eigenvalues > RANK_TOLERANCE * largest
+    inverse_roots = np.where(is_counted, 1.0 / np.sqrt(np.where(is_counted, eigenvalues, 1.0)), 0.0)
+    root: Array = eigenvectors * inverse_roots[..., None, :] / scale
+    return root
