@@ -113,7 +113,8 @@ def clip_coefficients(evaluator: RunEvaluator, name: str, c: Array) -> Array:
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         c: (k,) its coefficients.
     """
-    clipped: Array = np.clip(c, *np.array(compute_coefficient_bounds(evaluator, name)).T)
+    low, high = np.array(compute_coefficient_bounds(evaluator, name)).T
+    clipped: Array = np.clip(c, low, high)
     return clipped
 
 

@@ -295,6 +295,7 @@ class SearchControl:
         state = self.deadline, self._stop_reason, self._has_abandoned_fits
         if self.deadline is not None:
             self.deadline += self._reserve
+        # If the user has stopped the search, `should_stop` finds out again.
         self._stop_reason, self._has_abandoned_fits = None, False
         try:
             yield

@@ -391,9 +391,10 @@ class FitState:
         return updated_jacobian
 
     def mark_converged(self) -> None:
-        """Mark the fit as converged if its derivatives belong to the present point.
+        """End the fit, which hardly gains any more, if its derivatives belong to the present point.
 
-        Otherwise the derivatives must be recomputed first.
+        Otherwise it waits for new derivatives, which are computed once it is known that the fit is
+        not far behind others.
         """
         if self.has_own_jacobian:
             self.end()

@@ -386,10 +386,10 @@ def compute_difference_steps(jacobian: Array, noise: NoiseModel, widths: Array) 
     """
     squares = np.square(jacobian / noise.sigma[:, None])
     responses = np.sqrt(np.mean(squares, axis=(0, 1, 2)))
-    states = np.full(len(responses) - len(widths), MAX_STEP)
-    largest = np.concatenate([MAX_STEP * widths, states])
+    max_state_steps = np.full(len(responses) - len(widths), MAX_STEP)
+    max_steps = np.concatenate([MAX_STEP * widths, max_state_steps])
     # An unknown without any response gets the maximum step.
     with np.errstate(divide="ignore"):
         target_steps = TARGET_RESPONSE_SIGMAS / np.where(responses > 0, responses, 1e-300)
-    steps: Array = np.clip(target_steps, MIN_STEP_RATIO * largest, largest)
+    steps: Array = np.clip(target_steps, MIN_STEP_RATIO * max_steps, max_steps)
     return steps

@@ -621,11 +621,8 @@ class TrajectoryFitter:
             point: the point, simulated together with its derivatives.
         """
         fit_state.point = point
-        fit_state.has_own_jacobian, fit_state.is_jacobian_stale, fit_state.is_waiting = (
-            True,
-            False,
-            False,
-        )
+        fit_state.has_own_jacobian = True
+        fit_state.is_jacobian_stale = fit_state.is_waiting = False
         fit_state.steps = compute_difference_steps(point.jacobian, self.noise, fit_state.widths)
 
     def _compute_residual(self, simulated: Array, sample_mask: Mask) -> Array:

@@ -89,8 +89,8 @@ class BaseModel:
     def refit(self, runs: SimulatedRuns) -> BaseModel:
         """Fit the base model to runs with other numerical settings.
 
-        They change the best parameters only a little, so the fit needs no other starts, unless this
-        fit failed.
+        They change the best parameters only a little, so the fit starts from those of this fit,
+        unless it failed or parameters were identified by prediction errors.
         """
         is_near = np.isfinite(self.fit.fit.cost) and runs.context.identified is None
         nearby = self.fit.fit.theta[runs.fitting.base_indices] if is_near else _get_starts(runs)

@@ -161,13 +161,14 @@ def _fill_lost_commands(runs: SimulatedRuns) -> SimulatedRuns:
     filled, note = fill_lost_commands(runs.recording)
     if not note:
         return runs
-    count = sum(
+    filled_row_count = sum(
         filled_run.times.size - run.times.size
         for filled_run, run in zip(filled.runs, runs.recording.runs, strict=True)
     )
     filled_runs = SimulatedRuns.build(runs.context, runs.kind, filled)
-    before, after = runs.nominal_filter.log_likelihood, filled_runs.nominal_filter.log_likelihood
-    if before > after + MIN_HELD_LOG_LIKELIHOOD * count:
+    held = runs.nominal_filter.log_likelihood
+    interpolated = filled_runs.nominal_filter.log_likelihood
+    if held > interpolated + MIN_HELD_LOG_LIKELIHOOD * filled_row_count:
         return runs
     runs.context.add_notes([note])
     return filled_runs

@@ -110,11 +110,8 @@ def _read_track_figure(recording: Recording) -> bytes:
             picture = file.read(MAX_TRACK_FIGURE_BYTES + 1)
     except OSError:
         return b""
-    return (
-        picture
-        if picture.startswith(PNG_SIGNATURE) and len(picture) <= MAX_TRACK_FIGURE_BYTES
-        else b""
-    )
+    is_usable = picture.startswith(PNG_SIGNATURE) and len(picture) <= MAX_TRACK_FIGURE_BYTES
+    return picture if is_usable else b""
 
 
 def _assess_consistency(result: SearchResult) -> ConsistencySummary:
@@ -166,14 +163,15 @@ def _estimate_parameters_by_group(
 
 
 def _assess_identifiability(search: EffectSearch) -> tuple[ParameterIdentifiability, ...]:
-    """Assess identifiability from the directions that the search has simulated.
+    """Assess identifiability from the responses of the runs to effects (directions).
 
-    If no directions are known, those of the scan of the base model are used; without them, the
-    result is empty.
+    The search has computed them about the base model, on their own or together with scores. If it
+    has not, the result is empty.
     """
-    key: frozenset[str] = frozenset()
     directions = search.get_known_directions()
     if directions is None:
+        # The base model has no effects.
+        key: frozenset[str] = frozenset()
         scan = search.cached_scans.get(key) or search.superseded_scans.get(key)
         if scan is None:
             return ()

@@ -156,7 +156,8 @@ def _propose_next_run(result: SearchResult) -> DiscriminatingRun | None:
     competing_models = result.list_competing_models()
     if not competing_models:
         return None
-    return propose_discriminating_run(search, finding.model, competing_models[0])
+    most_plausible, *_ = competing_models
+    return propose_discriminating_run(search, finding.model, most_plausible)
 
 
 def _compute_held_out_excess(result: SearchResult) -> float | None:

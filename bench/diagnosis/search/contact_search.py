@@ -662,6 +662,8 @@ def _search_simple_laws(search: EffectSearch) -> FittedModel:
         return search.run()
     if not best.effects:
         return best
+    # For the p-value of the effect, the surrogates of these scores stand for those about the model
+    # without it, which is not scored.
     search.reference_scores = search.score_missing_effects(best)
     _fit_competing_effects(search, best)
     models = [model for model in search.models.values() if len(model.effects) == 1]
