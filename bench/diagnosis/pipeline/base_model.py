@@ -1,10 +1,9 @@
-"""Fit of the base model of a diagnosis: filter, parameters, ranges and discretisation error."""
+"""Fit of the base model of a diagnosis: parameters, ranges, first states, discretisation error."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,13 +15,11 @@ from bench.diagnosis.fitting.base_fit import (
     refit_without_step_error,
 )
 from bench.diagnosis.identifiability import freeze_unidentified_parameters
+from bench.diagnosis.pipeline.run_filtering import filter_runs
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.validation.held_out_runs import find_first_states
 from sims.core.simulator import Array
 from sims.recording.recorded_poses import ANGLES
-
-if TYPE_CHECKING:
-    from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
 MAX_ROTATION_ERROR = 0.5
 """Maximum error in rad of the simulated orientation of a floating body.
@@ -231,67 +228,3 @@ def _get_starts(runs: SimulatedRuns) -> Array | None:
         identified = runs.context.identified
         return None if identified is None else identified.base
     return find_start_with_tuner(options.tuner, runs.fitting, runs.noise, options.seed)
-
-
-def filter_runs(runs: SimulatedRuns) -> None:
-    """Filter the runs of a robot with the present model (Kalman filter and smoother).
-
-    The filter, stored in the evaluators, provides initial states and starting values of free
-    parameters, and later the search by prediction errors.
-
-    1. Filter the runs for fitting with the numbers of the model file. If the linearised model is
-       not valid, nothing is stored, and causes are searched by simulation; for a robot in contact,
-       a nonlinear filter then estimates the initial states.
-    2. Filter them again with fitted base parameters, unless a tuner fits these.
-    3. Filter the held-out runs.
-    """
-    # This import is needed for robots only.
-    from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-
-    context = runs.context
-    context.search_control.begin_stage("computing prediction errors")
-    # 1. Model file.
-    filtered_runs = runs.nominal_filter
-    is_nonlinear = runs.contacts.needs_nonlinear_filter(filtered_runs)
-    if is_nonlinear or not filtered_runs.has_expected_innovations:
-        if runs.contacts.has_contacts:
-            # This import is needed for robots only.
-            from bench.diagnosis.kalman.cubature_filter import set_first_states_in_contact
-
-            theta = runs.fitting.get_nominal_theta()
-            set_first_states_in_contact(runs.evaluators, theta, runs.noise.sigma)
-        return
-    # 2. Base parameters.
-    if runs.fitting.base_indices.size and context.options.tuner is None:
-        filtered_runs = _filter_with_fitted_parameters(runs)
-    runs.fitting.follow(filtered_runs)
-    if context.search_control.is_over():
-        return
-    # 3. Held-out runs.
-    for evaluator in runs.evaluators[1:]:
-        # Held-out runs are only simulated; without a filter they begin at their measured values.
-        theta = evaluator.get_nominal_theta()
-        held_out = FollowedRuns.follow(evaluator, theta, runs.noise, max_linearisations=1)
-        if held_out.has_expected_innovations:
-            evaluator.follow(held_out)
-
-
-def _filter_with_fitted_parameters(runs: SimulatedRuns) -> FollowedRuns:
-    """Return the runs, filtered with base parameters from a prediction-error fit.
-
-    The fitted parameters are stored in context and evaluator, unless the fit keeps the nominal
-    ones.
-    """
-    # These imports are needed for robots only.
-    from bench.diagnosis.prediction_error.base_identification import identify_base
-    from bench.diagnosis.prediction_error.identification_without_simulation import is_long
-
-    evaluator = runs.fitting
-    with runs.record_widened_ranges():
-        # Long recordings are those of real robots, whose joints certainly have friction.
-        result = identify_base(
-            evaluator, runs.noise, runs.nominal_filter, is_resisted=is_long(evaluator)
-        )
-    if result.parameters is not None:
-        runs.context.identified = evaluator.identified = result.parameters
-    return result.followed

@@ -12,8 +12,9 @@ from bench.diagnosis.numerics_cause import (
     is_finer_model_better,
     is_finer_step_better,
 )
-from bench.diagnosis.pipeline.base_model import BaseModel, filter_runs
+from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.cause_search import CauseSearch
+from bench.diagnosis.pipeline.run_filtering import filter_runs
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.search.verdict_rules import is_indistinguishable
 
