@@ -401,7 +401,8 @@ class AlternativeFinder:
 
         This matters only if the residual has structure, because likelihoods then do not account for
         the number of coefficients. Each further coefficient must reduce the excess residual (RMS
-        residual in units of the noise, minus one) as much as a richer law must: to 95 %.
+        residual in units of the noise, minus one) as much as a richer law must, to the share
+        `MAX_RICHER_LAW_EXCESS_RATIO`.
 
         Args:
             effect: effect of the model.

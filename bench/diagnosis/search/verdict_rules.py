@@ -201,14 +201,14 @@ def is_indistinguishable(distance: float) -> bool:
 def convert_excess_ratio(ratios: Sequence[float]) -> float:
     """Convert ratios of excess residuals to a difference in twice the log-likelihood.
 
-    Both are distances of two models, and `is_indistinguishable` has a threshold of 7 for the
-    difference. A ratio of 1.2 is as indistinguishable:
+    Both tell how far another model is behind a model, and `is_indistinguishable` has a threshold D
+    for the difference. A ratio R (`INDISTINGUISHABLE_EXCESS_RATIO`) is equivalent to it:
 
-        difference = 7 mean(log ratios) / log 1.2                                              (1)
+        difference = D mean(log ratios) / log R                                                (1)
 
     Args:
         ratios: for each part of the data (fitted runs, held-out runs), the excess residual of the
-            worse model divided by that of the better one.
+            other model divided by that of the model; below 1 if the other one is better.
     """
     return (
         INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
