@@ -244,7 +244,9 @@ class _RecordingSimulation:
         constants, system = self.simulator.constant_values, self.name
         path = Path(f"{system}-simulated.csv")  # Used in messages only; there is no such file.
         model_path = Path(self.options.model) if self.options.model else None
-        model = model_path and ModelFileReference(model_path, self.options.actuators or {}, {})
+        model = None
+        if model_path is not None:
+            model = ModelFileReference(model_path, self.options.actuators or {}, {})
         title = f"{system}, simulated"
         recording = Recording(path, system, title, constants, stated_noise, runs, model=model)
         truth = {

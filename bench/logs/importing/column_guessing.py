@@ -113,7 +113,7 @@ def split_name(text: str) -> list[str]:
     consist of a quantity and a word for a command, are divided into both.
     """
     spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
-    words = []
+    words: list[str] = []
     for part in re.split(r"[\W_]+|(?<=[^\W\d_])(?=\d)", spaced):
         word = part.lower()
         joined_words = _JOINED_WORDS_PATTERN.fullmatch(word)

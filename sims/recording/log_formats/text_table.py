@@ -697,11 +697,11 @@ class _TextColumn:
         has_point = self.filled.str.contains(".", regex=False)
         if not has_point.any():
             return self.series.str.replace(",", ".", n=1, regex=False)
-        row = int(has_point.idxmax())  # the first one
+        first_row, *_ = has_point.index.to_numpy()[has_point.to_numpy()]
         is_grouped = self.filled[has_point].str.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?")
         expected = "a number without a point" if is_grouped.all() else "a decimal comma"
         note = "; other cells of this column have decimal commas"
-        raise self._make_cell_error(row, expected, note)
+        raise self._make_cell_error(int(first_row), expected, note)
 
     def _convert_dates(self) -> Array | None:
         """Convert times such as ``2026-11-26 17:24:01.123`` to (T,) seconds since 1970.
