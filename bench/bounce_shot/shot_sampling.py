@@ -45,7 +45,8 @@ def draw_shot(
         settings: settings of the bounce shot, from the table [shot] of the experiment.
         kind: kind of ball.
         index: index of the shot with this kind of ball.
-        salt: salt from which the shot is drawn.
+        salt: text that is part of the seed, so that the shot cannot be predicted without it; a
+            public or empty one is left out.
     """
     rng = make_rng(*get_stream_prefix(salt), experiment.name, "shot", kind, index)
     # The order of the draws is part of the experiment: another order gives other shots.
@@ -73,7 +74,7 @@ def draw_shots(experiment: Experiment, settings: ShotConfig, salt: str = "") -> 
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
         settings: settings of the bounce shot, from the table [shot] of the experiment.
-        salt: salt from which the shots are drawn.
+        salt: text that is part of the seeds, so that shots cannot be predicted without it.
     """
     return [
         draw_shot(experiment, settings, kind, i, salt)

@@ -102,7 +102,7 @@ class BounceShotStudy(Study):
     def experiment(self) -> Experiment:
         """The experiment, with the tuners that can be used."""
         complete_experiment = self.configuration.experiment
-        # Skipped tuners would have empty lines; `finish` reports why they are missing.
+        # Skipped tuners would have empty lines in the tables; `finish` reports why.
         labels = [
             entry.label
             for entry in complete_experiment.tuners
@@ -129,9 +129,13 @@ class BounceShotStudy(Study):
             jobs: number of worker processes.
             progress: makes progress callbacks; None for no progress output.
             pool: worker pool; None to create one.
+
+        Returns:
+            How many shots are stored and missing; the reason if the true world is not available.
         """
         if reason := true_world.find_missing_requirement():
             return self.count_finished(skipped=reason)
+        # Worker processes import the classes of the tuners by their names.
         if pool is not None or jobs:
             check_classes_importable(self.experiment)
 
@@ -144,7 +148,7 @@ class BounceShotStudy(Study):
         return self.finish(make_missing_shots)
 
     def list_run_ends(self) -> list[RunEnd]:
-        """Return which shots are stored and which are missing.
+        """Return for each shot whether it is stored ("made") or missing.
 
         Raises:
             InputError: the file of a shot is damaged.
@@ -356,4 +360,15 @@ def _make_failed_models(
         tuned_shots.EXPLAIN_METHOD,
         *(label + tuned_shots.EXPLAIN_SUFFIX for label in labels),
     ]
-    return [TunedModel(method, math.nan, {}, 0, math.nan, status, str(error)) for method in methods]
+    return [
+        TunedModel(
+            method,
+            restitution=math.nan,
+            effects={},
+            simulations=0,
+            seconds=math.nan,
+            status=status,
+            reason=str(error),
+        )
+        for method in methods
+    ]

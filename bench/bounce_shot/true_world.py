@@ -250,10 +250,11 @@ class _Flight:
 
 
 def _render_mjcf(ball: BallKind, ground: InclinedGround) -> str:
-    """Render the MuJoCo model: an inclined plane, and a free sphere above it.
+    """Render the MuJoCo model (MJCF): an inclined plane, and a free sphere above it.
 
-    Contacts are frictionless (``condim`` 1), because `_Flight` applies the friction. The moments of
-    inertia are equal about all axes.
+    Contacts are frictionless (``condim`` 1), because `_Flight` applies the friction. The parameters
+    of a contact are those of the sphere (``priority`` 1). The moments of inertia are equal about
+    all axes.
 
     Args:
         ball: properties of the ball.

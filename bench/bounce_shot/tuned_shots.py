@@ -112,7 +112,8 @@ def tune_and_plan(
     """Tune all methods to the recording of a drop, and plan a shot with each.
 
     The methods are: the untuned simulator; each tuner in the original simulator; the fit of
-    explain; and each tuner in the simulator that explain has extended with effects.
+    `explain`, which searches for effects that the simulator lacks; and each tuner in the simulator
+    that `explain` has extended with such effects.
 
     Args:
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
@@ -123,7 +124,15 @@ def tune_and_plan(
         The tuned model of each method, with its plan.
     """
     recording = read_recording(inputs.recording, BallSimulator, whole=True)
-    models = [TunedModel(UNTUNED_METHOD, _get_nominal_restitution(), {}, 0, 0.0, "done")]
+    untuned = TunedModel(
+        UNTUNED_METHOD,
+        restitution=_get_nominal_restitution(),
+        effects={},
+        simulations=0,
+        seconds=0.0,
+        status="done",
+    )
+    models = [untuned]
     models += [
         _tune_model(experiment, settings, entry, inputs, recording, {})
         for entry in experiment.tuners
@@ -208,7 +217,13 @@ def _tune_model(
     # The restitution is the only parameter.
     restitution = float(problem.cube.to_physical(trace.recommendations[-1])[0])
     return TunedModel(
-        label, restitution, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason
+        label,
+        restitution,
+        effects={},
+        simulations=len(trace.losses),
+        seconds=outcome.seconds,
+        status=trace.status,
+        reason=trace.reason,
     )
 
 

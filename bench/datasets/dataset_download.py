@@ -90,6 +90,8 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
 def _join_records(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """Join the angles and rates (2, T) of all pieces of a MATLAB file, in their order.
 
+    The pieces are entries of the cell arrays ``Y_id`` and, after them, ``Y_vad``.
+
     Args:
         name: name of the file, for messages.
         content: content of the file.

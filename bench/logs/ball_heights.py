@@ -89,7 +89,8 @@ def compute_heights_by_camera(track: BallTrack, filmed: FilmDescription) -> Ball
         InputError: The camera's image has another aspect ratio than the film.
     """
     camera = filmed.camera
-    if camera.size[0] * track.size[1] != camera.size[1] * track.size[0]:
+    (width, height), (film_width, film_height) = camera.size, track.size
+    if width * film_height != height * film_width:
         sizes = f"the camera's picture has {camera.size} px, the film {track.size}"
         raise InputError(f"{sizes}; expected the same shape")
     # The film may have been resized, so the camera is resized with it.

@@ -25,12 +25,8 @@ def load_joined(
 ) -> tuple[Recording, type[Simulator]]:
     """Read several recordings, join them into one, and find their simulator.
 
-    * Runs get the name of their log in front, since several logs may have the same run names.
-    * Up to `MAX_FOLDS` runs in total, none of them marked as held out, are cross-validated.
-      Otherwise each recording holds out the runs that it would hold out alone, at least one.
-    * A constant that the recordings state differently becomes a constant of the runs.
-    * The noise of a channel is the root mean square of the stated noises; it is unknown if some
-      recording states none.
+    Up to `MAX_FOLDS` runs in total, none of them marked as held out, are cross-validated.
+    Otherwise each recording holds out the runs that it would hold out alone, at least one.
 
     Args:
         sources: Paths of the tables, or recordings in memory.
@@ -67,10 +63,15 @@ def load_joined(
 
 
 def _join_recordings(recordings: Sequence[Recording], kind: type[Simulator]) -> Recording:
-    """Join recordings that `_check_joinable` accepts; see `load_joined`.
+    """Join recordings of one system into one.
+
+    * Runs get the name of their log in front, since several logs may have the same run names.
+    * A constant that the recordings state differently becomes a constant of the runs.
+    * The noise of a channel is the root mean square of the stated noises; it is unknown if some
+      recording states none.
 
     Args:
-        recordings: recordings of one system with the same channels and inputs.
+        recordings: recordings with the same channels and inputs.
         kind: simulator class of their system, which declares the constants.
     """
     first_recording = recordings[0]

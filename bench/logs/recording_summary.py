@@ -319,7 +319,7 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
 def format_robot_summary(kind: type[Simulator]) -> Iterator[str]:
     """Yield lines about the robot of a simulator: its file, its parts and notes on repairs.
 
-    Other simulators have no lines.
+    Nothing is yielded for a simulator of another system.
     """
     if not kind.has_model:
         return

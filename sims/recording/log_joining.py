@@ -213,6 +213,7 @@ class _FolderLogs:
         """
 
         def stamps_of(names: Sequence[str]) -> list[Array]:
+            """Return the stamps of the logs that hold some signals."""
             return [rows_of[self._logs[name].path].stamps for name in names]
 
         measured = np.unique(np.concatenate(stamps_of(self._channels)))

@@ -182,6 +182,7 @@ def get_model_reference(
     actuators = remove_switch_keys(get_subtable(description, meta, "actuators"))
     engine = dict(get_subtable(description, meta, "engine"))
     bases = find_recorded_bases(list_nested_names(get_subtable(description, meta, "channels")))
+    # A body whose pose is recorded gets six joints with one coordinate each, unless it is fixed.
     if bases and not engine.get("fix_base"):
         engine["recorded_bases"] = bases
     free = check_name_list(description, "free", meta.get("free", []), 'names, as ["damping@*"]')
@@ -682,12 +683,15 @@ class _DescriptionReader:
     def _read_numbers(
         self, key: str, value: Any, allowed_names: Collection[str]
     ) -> dict[str, float]:
-        """Check a table of finite numbers, whose names must be among the allowed ones.
+        """Read a table of finite numbers, whose names must be among the allowed ones.
 
         Args:
-            key: key of the table.
-            value: the table.
+            key: key of the table, for messages.
+            value: the table; names with dots may be written as nested tables.
             allowed_names: names that may occur in it.
+
+        Raises:
+            InputError: it is not such a table.
         """
         entries = join_nested_names(check_table(self.path, key, value), allowed_names)
         self._check_known_names(key, entries, allowed_names)

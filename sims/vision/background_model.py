@@ -90,14 +90,14 @@ def compute_masked_background(
 def estimate_camera_noise(pictures: list[RgbImage], background: RgbImage) -> float:
     """Estimate the camera noise from pictures in which little differs from the background.
 
-    It is the median difference from the background, which most pixels show, over all pixels.
+    Most pixels show the background, so the median difference from it is due to noise.
 
     Args:
         pictures: Pictures (height, width, 3).
         background: Background (height, width, 3).
 
     Returns:
-        Standard deviation in grey levels of the worst colour.
+        Standard deviation of the noise of a colour, grey levels.
     """
     # About eight pictures suffice, because each has many pixels.
     stride = max(1, len(pictures) // 8)

@@ -600,6 +600,7 @@ def _compute_surrounding_colour(picture: RgbImage, detection: BallDetection) -> 
     height, width = picture.shape[:2]
     circle_radius = _SURROUNDINGS_RADII * detection.radius
     median_index = _RAY_COUNT // 2
+    # The pixels nearest to the circle.
     rows = (detection.v + circle_radius * sin[:, 0] + 0.5).astype(np.intp)
     columns = (detection.u + circle_radius * cos[:, 0] + 0.5).astype(np.intp)
     # Beyond the border, the outermost pixels are repeated.

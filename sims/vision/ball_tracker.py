@@ -561,15 +561,15 @@ def _note_other_objects(
     """
     frames = set(path.frames)
     for other_path in other_paths:
-        shared = len(frames & set(other_path.frames))
+        shared_count = len(frames & set(other_path.frames))
         # A brief, small or resting object is not a second ball.
-        is_simultaneous = shared >= max(8, 0.25 * len(path.frames))
+        is_simultaneous = shared_count >= max(8, 0.25 * len(path.frames))
         is_moving = other_path.travel > 2 * other_path.radius
         smallest, largest = _SIMILAR_RADIUS_RATIOS
         is_similar = smallest < other_path.radius / path.radius < largest
         if is_simultaneous and is_moving and is_similar:
             notes.append(
-                f"a second ball, or its shadow, moves in {shared} of the same frames; "
+                f"a second ball, or its shadow, moves in {shared_count} of the same frames; "
                 "the clearer one is tracked"
             )
             return

@@ -417,9 +417,12 @@ class RunLogs:
         return clocks
 
     def _complete_columns(self, logs: Mapping[str, LogFile]) -> list[LogColumn]:
-        """Return the columns that have one number for each time stamp of their file.
+        """Return the columns, except the time stamps, with one number for each time stamp.
 
-        Other columns are left out with a message.
+        Columns of another length or without any number are left out with a message.
+
+        Args:
+            logs: Logs of the first run by file.
         """
         columns = []
         for file, seconds in self.seconds.items():

@@ -82,6 +82,8 @@ class Signal:
     def convert(self, unit: str, values: Array) -> Array:
         """Convert numbers of the column to an SI unit.
 
+        Scale and offset give a value in `self.unit`, which is then converted.
+
         Args:
             unit: SI unit of the result.
             values: (T,) numbers of the column.

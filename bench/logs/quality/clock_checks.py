@@ -269,7 +269,7 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     For each recorded coordinate, the time in which it moves in the recording is compared with the
     time that its own forces would need. There are three cases:
 
-    * Far too fast: an anomaly that is not certain.
+    * Far too fast, by `TIME_UNIT_RATIO_THRESHOLD`: an anomaly that is not certain.
     * Far too slow, and the sampling interval exceeds the expected time, for a robot with inputs by
       `DRIVEN_SYSTEM_FACTOR`: an anomaly. It is certain, so that it stops the program, if there are
       no inputs, or the interval exceeds the expected time by that factor.
@@ -305,7 +305,8 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
         expected_seconds = _compute_free_motion_time(values, accelerations[:, column], min_spread)
         if expected_seconds is None:
             continue
-        recorded_seconds = interval * _estimate_lag(values)  # Equation (1).
+        # Shortest time after which the values differ by as much as their spread.
+        recorded_seconds = interval * _estimate_lag(values)
         ratio = recorded_seconds / expected_seconds
         if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
             moves = (
@@ -370,6 +371,7 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
         run: recorded run: times, channels and inputs.
         system: system of the recording.
     """
+    # Each sample of the run is an element of a batch of T states.
     count = run.times.size
     values = {**recording.constants, **run.constants}
     constants = {c.name: np.full((count, 1), values.get(c.name, c.value)) for c in system.constants}

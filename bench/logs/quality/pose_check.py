@@ -29,12 +29,17 @@ _STATIC_TREE = -1
 def find_contacts(
     kind: type[Simulator], positions: Mapping[str, Array]
 ) -> frozenset[tuple[int, int]]:
-    """Find pairs of a robot's geoms that touch at some of `CHECKED_INSTANTS` times of a motion.
+    """Find pairs of a robot's geoms (collision shapes) that touch during a motion.
+
+    At most `CHECKED_INSTANTS` poses of the motion are evaluated.
 
     Args:
         kind: Simulator class of the robot.
         positions: (N,) position of each joint, rad or m, by channel; other joints keep their
             initial position.
+
+    Returns:
+        Pairs of the geoms' numbers in MuJoCo, the smaller one first.
     """
     pairs: set[tuple[int, int]] = set()
     for data in iterate_poses(kind, positions):
@@ -69,7 +74,7 @@ def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
 
 
 def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple[str, ...]:
-    """Return the names of the pairs of a robot's geoms that touch in the recorded poses.
+    """Return the pairs of a robot's geoms (collision shapes) that touch in the recorded poses.
 
     Joints that are not recorded keep their initial position. Contacts that cannot act on a recorded
     joint, such as those of an object that rests on a table next to the robot, are left out.

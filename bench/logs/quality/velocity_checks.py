@@ -288,10 +288,12 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
 
 
 def _recommend_correction(log_ratio: float, rate: str) -> str:
-    """Recommend a correction for a velocity that is wrong by a ratio, given as its logarithm.
+    """Recommend a correction for a velocity that is wrong by a factor.
+
+    If the factor is that between two usual units, the unit is wrong.
 
     Args:
-        log_ratio: natural logarithm of the ratio of velocity and derivative.
+        log_ratio: absolute natural logarithm of the factor.
         rate: name of the velocity.
     """
     for factor, unit in _UNIT_BY_RATIO.items():

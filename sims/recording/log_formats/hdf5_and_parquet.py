@@ -157,6 +157,7 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
         if parent_group is None or not hasattr(parent_group, "items"):
             known = ", ".join(_list_group_names(file)) or "none"
             raise InputError(f"{path}: unknown group '{group}'; there are: {known}")
+        # All members of the group and of the groups in it, by their paths.
         datasets: dict[str, Any] = {}
         parent_group.visititems(lambda name, dataset: datasets.update({name: dataset}))
         for name, dataset in datasets.items():

@@ -76,6 +76,8 @@ def read_messages(path: Path, topic: str) -> Iterator[tuple[Any, int]]:
 def _make_decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], Any]:
     """Return the function that decodes the messages of a channel, JSON or Protobuf.
 
+    A channel is the part of a topic with one encoding and one schema.
+
     Args:
         path: path of the bag, for messages.
         encoding: encoding of the messages, ``json`` or ``protobuf``.

@@ -344,7 +344,7 @@ def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple
 
 
 def is_numeric(cell: str) -> bool:
-    """Return whether a cell holds a number, a list of numbers, a time or a missing-number mark.
+    """Return whether a cell holds a number, a list of numbers, a time or a mark such as "nan".
 
     Args:
         cell: Text of a cell, such as "1.5", "[0.1, 0.2]", "2026-01-31T12:00:00" or "nan".
