@@ -284,7 +284,7 @@ class ProgressDisplay:
             self._shown = line
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Begin a stage; see `ProgressListener`.
+        """Show that a stage of the search begins, with a count of its steps.
 
         Args:
             name: name of the stage.
@@ -299,7 +299,7 @@ class ProgressDisplay:
         self._redraw_if_due()
 
     def found(self, effects: Sequence[str], share: float) -> None:
-        """Store the best model so far; see `ProgressListener`.
+        """Show the best model so far.
 
         Args:
             effects: names of the effects of the model.
@@ -311,7 +311,7 @@ class ProgressDisplay:
         self._redraw_if_due()
 
     def completed(self, share: float) -> None:
-        """Estimate the remaining time from the share done; see `ProgressListener`.
+        """Estimate the remaining time from the share of the search that is done.
 
         The remaining time is the elapsed time multiplied by (1 - share) / share.
 

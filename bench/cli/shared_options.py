@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def add_options(
     parser: argparse.ArgumentParser, options: type, **changed: Mapping[str, Any]
 ) -> None:
-    """Add the options of a command that an options dataclass declares; see `bench.core.options`.
+    """Add the options of a command that an options dataclass declares by `bench.core.options`.
 
     So options of the command line and arguments in Python are declared once. The annotation of a
     field decides how a value is parsed, and its entry in the class docstring is the help.

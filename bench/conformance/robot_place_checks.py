@@ -281,6 +281,7 @@ def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, 
     from sims.robot.dynamics.added_elements import add_elements, list_added_elements
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
+    # The effect as changes of fields of MuJoCo's model, for some of which bodies must be added.
     native = MODEL_FIELD_EFFECTS[effect.of]
     robot = add_elements(kind.robot, list_added_elements(effect))  # type: ignore[attr-defined]
     changed = _compare_fields(
@@ -348,22 +349,28 @@ def _find_forced_coordinates(
 ) -> tuple[object, ...]:
     """Return the coordinates on which an effect exerts a force or friction.
 
-    The effect is called at one state in motion. `c` are its coefficients, `kind` is the simulator
-    class.
+    The effect is called at one state in motion. `c` are its coefficients (K, 2, 1), `kind` is the
+    simulator class of the arm. A force is shown by the indices of joints, a friction by its name.
     """
     from sims.robot.dynamics.effect_forces import make_snapshot
 
     system = kind.system()  # type: ignore[attr-defined]
-    # Positions, inputs and forces are arbitrary and not zero, SI units.
+    # All numbers are arbitrary and not zero, SI units: two batch elements of two joints.
     x = np.array([[0.3, -0.4], [0.8, 0.2]])
-    inputs = {c.name: np.full((2, 1), 0.3) for c in system.inputs}
-    stiffness = np.ones_like(x)
-    carried = np.stack([0.5 + x, 0.4 + x])
-    moment = make_snapshot(system, np.full((2, 1), 0.4), x, 1.0 - x, inputs, carried, stiffness)
+    moment = make_snapshot(
+        system,
+        t=np.full((2, 1), 0.4),
+        x=x,
+        v=1.0 - x,
+        inputs={channel.name: np.full((2, 1), 0.3) for channel in system.inputs},
+        carried=np.stack([0.5 + x, 0.4 + x]),
+        stiffness=np.ones_like(x),
+    )
     if isinstance(effect, Friction):
         return (effect.coordinate,) if np.any(effect.limit(c, moment)) else ()
     if isinstance(effect, HiddenStateEffect):
         force, _ = effect.act(c, moment, HiddenState(np.full((2, 1), 0.1), np.full((2, 1), 0.5)))
     else:
         force = effect.force(c, moment)
-    return tuple(int(joint) for joint in np.unique(np.nonzero(force)[1]))
+    _, joints = np.nonzero(force)
+    return tuple(int(joint) for joint in np.unique(joints))

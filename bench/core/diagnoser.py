@@ -187,7 +187,9 @@ class DiagnosisCase:
         engine = None if self.kind.own_engine else "batch"
         simulator = self.kind(constants, recorded, engine=engine, fixed=fixed)
         values = parameters or {}
-        theta = [values.get(p.name, p.nominal) for p in simulator.parameters]
+        theta = [
+            values.get(parameter.name, parameter.nominal) for parameter in simulator.parameters
+        ]
         initial_states = {**self.kind.states, **run.initial, **(initial or {})}
         scenario = Scenario(run.times, initial_states, dict(run.inputs))
         try:

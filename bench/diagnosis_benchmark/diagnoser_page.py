@@ -182,6 +182,8 @@ def _list_shares(data: DiagnoserReportData) -> list[str]:
 def make_charts(data: DiagnoserReportData) -> dict[str, list[Panel]]:
     """Make the panels of every chart by name; a chart without data has none.
 
+    The chart ``board`` is the leaderboard: named causes against false alarms.
+
     Args:
         data: graded answers and result tables of all diagnosers.
     """

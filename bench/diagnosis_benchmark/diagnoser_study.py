@@ -85,19 +85,22 @@ class DiagnosisStudy(Study):
 
     @classmethod
     def begin(cls, new: PreparedStudy) -> DiagnosisStudy:
-        """Create a comparison in a new folder, without running it; see `Study.begin`.
+        """Create a comparison in a new folder, without running it.
 
         Args:
             new: folder, experiment, plugins and salt, from `prepare_study`.
+
+        Raises:
+            InputError: the cases or diagnosers cannot be used; no folder is made then.
         """
-        settings = read_config(new.experiment)
-        build_case_set(settings)
+        # Errors in the specification of cases are reported before the folder exists.
+        build_case_set(read_config(new.experiment))
         _check_code_isolated(new.experiment)
         return cls(new.create_folder())
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Self:
-        """Open an interrupted comparison in order to run it; see `Study.resume`.
+        """Open an interrupted comparison in order to run what is missing.
 
         Args:
             folder: result folder.
@@ -141,7 +144,7 @@ class DiagnosisStudy(Study):
     def run(
         self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
     ) -> StudyOutcome:
-        """Collect the missing answers; see `Study.run`.
+        """Collect the missing answers, each of which is stored at once.
 
         Args:
             jobs: number of worker processes.
@@ -238,7 +241,9 @@ class _EvaluationRun:
         Raises:
             PoolLostError: the workers are no longer available.
         """
-        open_questions = [q for q in self._shuffle_cases() if self._list_unanswered(q)]
+        open_questions = [
+            question for question in self._shuffle_cases() if self._list_unanswered(question)
+        ]
         if not open_questions:
             return
         # The true causes are in the memory of this process, and a diagnoser's process may run as

@@ -78,16 +78,15 @@ def grade_answer(case: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grad
         verdict: the answer as a dictionary; None for a missing answer.
     """
     if verdict is None:
-        return Grade("failed", 0, 0, "", {})
+        return Grade("failed", set_size=0, class_size=0, named="", covered={})
     sets = list_named_sets(verdict)
     outcome, set_size, class_size = grade_sets(
         case.kind, case.effects, verdict, lambda effect: find_equivalent_effects(case, effect)
     )
-    covered = (
-        _check_interval_coverage(case, verdict, sets)
-        if outcome in ("right", "set") and case.kind != "foreign"
-        else {}
-    )
+    covered = {}
+    # An unmodelled cause has no coefficients, and parameters fitted without it are wrong.
+    if outcome in ("right", "set") and case.kind != "foreign":
+        covered = _check_interval_coverage(case, verdict, sets)
     named_effects = " + ".join("|".join(names) for names in sets)
     return Grade(outcome, set_size, class_size, named_effects, covered)
 
@@ -218,8 +217,8 @@ def _check_interval_coverage(
 ) -> dict[str, bool | None]:
     """Compare the intervals of base parameters and of leading causes with the true values.
 
-    A diagnoser that is right must also be sure for good reason: about 95 % of its intervals should
-    contain the true value.
+    The intervals of a correct diagnoser must be calibrated, too: about 95 % of them should contain
+    the true value.
 
     Args:
         case: the case with its true causes.

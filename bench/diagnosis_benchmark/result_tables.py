@@ -524,7 +524,8 @@ def build_failure_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFram
     )
     wrong_rows = graded_rows[~graded_rows["right"]].copy()
     correct_by_case = [
-        [name for name in order if name in correct_names.get(q, ())] for q in wrong_rows["question"]
+        [name for name in order if name in correct_names.get(question, ())]
+        for question in wrong_rows["question"]
     ]
     wrong_rows["right_by"] = [" ".join(names) or "nobody" for names in correct_by_case]
     wrong_rows["position"] = wrong_rows["diagnoser"].map({name: i for i, name in enumerate(order)})

@@ -54,10 +54,13 @@ def estimate_noise_sigma(observations: Array, lengths: tuple[int, ...]) -> Array
         third_differences = np.abs(np.diff(run, n=3, axis=1))
         count = min(_MAX_PARTS, max(1, third_differences.shape[1] // _MIN_PART_DIFFERENCES))
         parts = np.array_split(third_differences, count, axis=1)
-        for i, channel_index in np.ndindex(sigmas.shape):
-            min_median = _compute_min_part_median([part[i, :, channel_index] for part in parts])
+        for index in np.ndindex(sigmas.shape):
+            observation_index, channel_index = index
+            min_median = _compute_min_part_median(
+                [part[observation_index, :, channel_index] for part in parts]
+            )
             noise = min_median / (_NORMAL_MAD * _THIRD_DIFFERENCE_STD)
-            sigmas[i, channel_index] = max(float(sigmas[i, channel_index]), noise)
+            sigmas[index] = max(float(sigmas[index]), noise)
     return sigmas
 
 

@@ -103,9 +103,10 @@ def get_weight_shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str
         width: number of units of a layer.
         dim: number of parameters.
     """
+    proposed_inputs, target_inputs = inputs
     sizes = (
-        (inputs[0], width),
-        (inputs[1], width),
+        (proposed_inputs, width),
+        (target_inputs, width),
         (2 * width, width),
         (width, dim),
     )
@@ -204,28 +205,31 @@ def train_pair_network(
         return INITIAL_WEIGHT_LIMIT if name.endswith("weight") else 0.0
 
     def fit(weights: Weights, generator: Any) -> None:
-        x, target_rows, y = _convert_to_tensors(rows, parameters)
+        proposed_rows, target_rows, y = _convert_to_tensors(rows, parameters)
         loss = _make_loss(design, weights, alone)
         monitor = None
         if watched is not None:
             held_out = _convert_to_tensors(*watched.held_out)
             monitor = TrainingMonitor(lambda: loss(*held_out), watched.epoch)
         rates = [design.rate * _LEARNING_RATE_DECAY**epoch for epoch in range(design.epochs)]
-        kind: Any = torch.optim.SGD
+        optimiser_class: Any = torch.optim.SGD
         if design.adam:
-            kind, rates = torch.optim.Adam, compute_cosine_rates(design.rate, design.epochs)
+            optimiser_class, rates = (
+                torch.optim.Adam,
+                compute_cosine_rates(design.rate, design.epochs),
+            )
 
         def draw_batches() -> Any:
-            order: Any = torch.randperm(len(x), generator=generator)
+            order: Any = torch.randperm(len(proposed_rows), generator=generator)
             return order.split(design.batch)
 
         values = list(weights.values())
         minimise_loss(
-            kind(values, lr=design.rate),
+            optimiser_class(values, lr=design.rate),
             rates,
             design.epochs,
             draw_batches,
-            lambda batch: loss(x[batch], target_rows[batch], y[batch]),
+            lambda batch: loss(proposed_rows[batch], target_rows[batch], y[batch]),
             monitor,
             # The penalty is in the loss and not torch's option, so that it is Eq. 1 for Adam too.
             lambda: design.weight_decay * sum((v**2).sum() for v in values),
@@ -282,7 +286,7 @@ def _make_loss(
         return torch.tanh(output) if design.bounded else output
 
     def objective(x: Any, target_rows: Any, y: Any) -> Any:
-        """Compute the mean squared error of the estimated parameter differences; see `_make_loss`.
+        """Compute the mean squared error of the estimated parameter differences.
 
         All m (m - 1) / 2 pairs of the m simulations of a scenario are used. With `is_target_only`
         (one input), the network estimates the parameters y themselves from the target's side.

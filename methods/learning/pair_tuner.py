@@ -82,7 +82,7 @@ class TrainedPairNetwork:
         return cls(design, features, weights, proposed)
 
     def predict_difference(self, proposed: Array, target: Array) -> Array:
-        """Compute h(proposed, target) of input rows; see `pair_network.estimate`.
+        """Estimate the parameters of the target less those of the proposed simulations.
 
         Args:
             proposed: (n, D) or (D,) input rows of the proposed side.
@@ -234,7 +234,14 @@ class PairTuner(NoiseMatchedTuner[TrainedPairNetwork]):
         training_range: Array,  # noqa: ARG002 - the network learns differences of parameters
         monitor: TrainingMonitor[TrainingData] | None,
     ) -> TrainedPairNetwork:
-        """Train the network for one noise level; see `NoiseMatchedTuner`."""
+        """Train the network on simulations with the noise of one level.
+
+        Args:
+            data: simulations to train on, with noise.
+            rng: random generator.
+            training_range: (2, dim) corners of the training range; unused.
+            monitor: monitor of the training; None for none.
+        """
         return TrainedPairNetwork.train(
             self.make_network_design(),
             data,

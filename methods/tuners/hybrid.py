@@ -196,7 +196,9 @@ class TuneNetLeastSquares(TuneNet):
         # The nearest points come first; each step is orthogonalised by Gram-Schmidt.
         for point_index in nearest[usable[nearest]]:
             step = steps[point_index]
-            parallel_part = sum((q * (q @ step) for q in basis), np.zeros(len(step)))
+            parallel_part = sum(
+                (direction * (direction @ step) for direction in basis), np.zeros(len(step))
+            )
             orthogonal_part = step - parallel_part
             length = np.linalg.norm(orthogonal_part)
             if length > _MIN_ORTHOGONAL_SHARE * np.linalg.norm(step):

@@ -77,13 +77,14 @@ class TrainedHistoryNetwork:
         The network sees points relative to the middle of the training range.
 
         Args:
-            target: (d,) projected row of the target.
-            simulations_seen: projected rows (d,) of the simulations so far.
+            target: (d,) row of network inputs of the target, projected by `apply_weights`.
+            simulations_seen: such rows (d,) of the simulations so far.
             tried: points (dim,) of the simulations so far.
         """
         window = self.design.window
         low, high = self.training_range
         middle, half_widths = (low + high) / 2.0, (high - low) / 2.0
+        # Without simulations the arrays have no rows, but the same columns.
         simulations = np.array(simulations_seen[-window:]).reshape(-1, target.size)
         points = np.array(tried[-window:]).reshape(-1, half_widths.size)
         proposals = predict_proposals(

@@ -385,9 +385,11 @@ class EvaluationHistory:
         return residuals
 
     def select_samples(self, share: float) -> Mask:
-        """Return the mask of the residuals in the first `share` of their run."""
-        first = np.concatenate([np.arange(n) < share * n for n in self.task.lengths])
-        return np.repeat(first, self.task.observed.shape[1])
+        """Return the mask (T C,) of the residuals in the first `share` of their run."""
+        is_early = np.concatenate(
+            [np.arange(length) < share * length for length in self.task.lengths]
+        )
+        return np.repeat(is_early, self.task.observed.shape[1])
 
     def find_untried_point(self, rng: np.random.Generator) -> Array:
         """Return the random candidate point that is farthest from all simulated points."""

@@ -155,7 +155,7 @@ class NeuralPosteriorEstimation(Tuner):
         features, foreign = InputFeatures.from_arrays(feature_arrays, self._make_feature_config())
         not_finite = [name for name, array in flow_arrays.items() if not np.isfinite(array).all()]
         if foreign or not_finite:
-            name = [*foreign, *not_finite][0]
+            name, *_ = *foreign, *not_finite  # the first one is reported
             raise ValueError(f"array {name}: expected an array of the flow, of finite numbers")
         self._flow = self._rebuild_flow(
             {name.removeprefix("flow."): array for name, array in flow_arrays.items()},

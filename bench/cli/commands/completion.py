@@ -55,13 +55,13 @@ def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
     for name, command in commands.choices.items():
         for action in command._actions:
             _set_completion(name, action, shtab)
-    words = {
+    names = {
         "experiments": experiment.list_experiment_names(),
         "parts": [name for registry in REGISTRIES for name in registry.names()],
         "schemas": list_schema_names(),
     }
-    words_by_key = {key: " ".join(values) for key, values in words.items()}
-    functions = _BASH_FUNCTIONS.format(**words_by_key) if shell == "bash" else ""
+    names_by_key = {key: " ".join(values) for key, values in names.items()}
+    functions = _BASH_FUNCTIONS.format(**names_by_key) if shell == "bash" else ""
     script: str = shtab.complete(parser, shell=shell, preamble=functions)
     return script
 
@@ -83,9 +83,9 @@ def _set_completion(command: str, action: argparse.Action, shtab: Any) -> None:
         action: its argument, changed in place.
         shtab: library that builds the completion script.
     """
-    known_words = _BASH_COMPLETERS.get((command, action.dest))
-    if known_words:
-        complete = {**shtab.FILE, "bash": known_words}
+    bash_function = _BASH_COMPLETERS.get((command, action.dest))
+    if bash_function:
+        complete = {**shtab.FILE, "bash": bash_function}
     elif is_path_argument(action):
         complete = shtab.FILE
     else:

@@ -51,6 +51,7 @@ def _run_datasheet(options: argparse.Namespace, print_line: PrintLine) -> Comman
     # Check this before the work, which may take minutes.
     check_folder_empty(options.out)
     display = ProgressDisplay(options.budget, silent=options.json)
+    # The arguments let the search print notes, show its progress and be stopped by Ctrl-C.
     with display, display.handle_interrupts() as arguments:
         settings = collect_options(options, DatasheetOptions) | arguments
         sheet = check_options(DatasheetOptions, settings)

@@ -181,10 +181,12 @@ def _describe_system(kind: Any) -> JsonDocument:
     """
     return {
         "parameters": [
-            _pick(p, "name", "unit", "nominal", "bounds", "training", "log", "says")
-            for p in kind.parameters
+            _pick(parameter, "name", "unit", "nominal", "bounds", "training", "log", "says")
+            for parameter in kind.parameters
         ],
-        "constants": [_pick(c, "name", "unit", "value", "says") for c in kind.constants],
+        "constants": [
+            _pick(constant, "name", "unit", "value", "says") for constant in kind.constants
+        ],
         "inputs": _describe_channels(kind.inputs),
         "states": [{"name": name, "value": value} for name, value in kind.states.items()],
         "channels": _describe_channels(kind.channels),
@@ -366,8 +368,8 @@ def _format_experiment(experiment: JsonDocument) -> list[str]:
     if experiment["tuners_skipped"] and not experiment["skipped"]:
         reasons = "; ".join(sorted(set(experiment["tuners_skipped"].values())))
         missing.append(f"without {', '.join(experiment['tuners_skipped'])}: {reasons}")
-    words = f"{'; '.join(missing)}. {experiment['says']}" if missing else experiment["says"]
-    return [f"{experiment['name']:22} {words} [{', '.join(experiment['tags'])}]"]
+    text = f"{'; '.join(missing)}. {experiment['says']}" if missing else experiment["says"]
+    return [f"{experiment['name']:22} {text} [{', '.join(experiment['tags'])}]"]
 
 
 def _format_system(system: JsonDocument) -> list[str]:
@@ -391,11 +393,12 @@ def _format_system(system: JsonDocument) -> list[str]:
             f"nominal {parameter['nominal']:g}  {parameter['says']}"
         )
     lines += [
-        f"  constant  {c['name']:18} {c['unit']:12} {c['value']:g}  {c['says']}"
-        for c in system["constants"]
+        f"  constant  {constant['name']:18} {constant['unit']:12} {constant['value']:g}  "
+        f"{constant['says']}"
+        for constant in system["constants"]
     ]
     lines += _format_channels("input", system["inputs"])
-    lines += [f"  state     {s['name']:18} {s['value']:>12g}" for s in system["states"]]
+    lines += [f"  state     {state['name']:18} {state['value']:>12g}" for state in system["states"]]
     return lines + _format_channels("channel", system["channels"])
 
 
@@ -471,7 +474,8 @@ def list_places(model: Path) -> JsonDocument:
             for joint in kind.robot.joints
         ],
         "actuators": [
-            _pick(a, "name", "kind", "joint", "range", "force") for a in kind.robot.actuators
+            _pick(actuator, "name", "kind", "joint", "range", "force")
+            for actuator in kind.robot.actuators
         ],
         "bodies": [_pick(body, "name", "mass", "aliases") for body in kind.robot.bodies],
         "inputs": [_pick(c, "name", "unit") for c in kind.inputs],

@@ -129,6 +129,8 @@ def _draw_each_with_references(
 ) -> list[JsonDocument]:
     """Draw each of several comparisons over the references that belong to its problem.
 
+    References of other problems cannot be drawn behind it; a line says so.
+
     Args:
         folders: folders of the comparisons.
         references: reference results.

@@ -210,7 +210,7 @@ def _choose_hidden_causes(
     equivalent_effects = find_equivalent_effects(system, True, first) | find_equivalent_effects(
         system, False, first
     )
-    return first, str(rng.choice([n for n in names if n not in equivalent_effects]))
+    return first, str(rng.choice([name for name in names if name not in equivalent_effects]))
 
 
 def find_coefficients(
@@ -291,7 +291,8 @@ def _compute_unexplained_size(
     if not np.isfinite(observed).all():
         return 0.0
     if kind == "foreign":
-        return refitted_residuals.find_best_effect(setting, observed)[1]
+        _, residual = refitted_residuals.find_best_effect(setting, observed)
+        return residual
     return min(
         refitted_residuals.compute_refitted_residual(setting, observed, name, coefficients)
         for name, coefficients in wrong_answers

@@ -97,7 +97,7 @@ def draw_effect_shape(
     if name in SHAPE_SAMPLERS:
         return SHAPE_SAMPLERS[name](coefficient_scale, BaseMotion(setting), rng)
     sign = float(rng.choice([-1, 1])) if name in SIGNED_EFFECTS else 1.0
-    return lambda s: (sign * coefficient_scale * s,)
+    return lambda strength: (sign * coefficient_scale * strength,)
 
 
 def get_max_strength(name: str) -> float:
@@ -131,7 +131,7 @@ def draw_direction(
     angle = rng.uniform(0, 2 * np.pi)
     cosine_part = coefficient_scale * float(np.cos(angle))
     sine_part = coefficient_scale * float(np.sin(angle))
-    return lambda s: (cosine_part * s, sine_part * s, *further_coefficients)
+    return lambda strength: (cosine_part * strength, sine_part * strength, *further_coefficients)
 
 
 def _draw_horizontal_direction(
@@ -150,7 +150,7 @@ def _draw_horizontal_direction(
     if motion.system == "ball":
         return draw_direction(coefficient_scale, motion, rng)
     sign = float(rng.choice([-1, 1]))
-    return lambda s: (sign * coefficient_scale * s,)
+    return lambda strength: (sign * coefficient_scale * strength,)
 
 
 def _draw_ripple(
@@ -212,10 +212,10 @@ def _draw_wind(
     """
     if motion.system == "slider":
         speed = float(rng.choice([-1, 1]) * rng.uniform(0.3, 2.0))
-        return lambda s: (coefficient_scale * s, speed)
+        return lambda strength: (coefficient_scale * strength, speed)
     speed, angle = rng.uniform(2.0, 8.0), rng.uniform(0, 2 * np.pi)
-    return lambda s: (
-        coefficient_scale * s,
+    return lambda strength: (
+        coefficient_scale * strength,
         float(speed * np.cos(angle)),
         float(speed * np.sin(angle)),
     )
@@ -241,7 +241,11 @@ def _draw_stribeck(
     # The static part is added to the Coulomb friction: its factor is 3 to 7 less 1.
     extra = rng.uniform(2.0, 6.0)
     speed = float(np.clip(motion.speed * rng.uniform(0.15, 0.5), 0.02, 2.0))  # m/s or rad/s
-    return lambda s: (coefficient_scale * s, extra * coefficient_scale * s, speed)
+    return lambda strength: (
+        coefficient_scale * strength,
+        extra * coefficient_scale * strength,
+        speed,
+    )
 
 
 def _draw_saturation(
@@ -260,7 +264,7 @@ def _draw_saturation(
         Function from the strength to the limit.
     """
     peak = motion.peak
-    return lambda s: (float(peak * (1 - s)),)
+    return lambda strength: (float(peak * (1 - strength)),)
 
 
 def _draw_direction_dependent_friction(
@@ -279,7 +283,10 @@ def _draw_direction_dependent_friction(
     shares = [1.0, float(rng.uniform(0.0, 0.3))]
     rng.shuffle(shares)  # either direction may be the one with more friction
     forward, backward = shares
-    return lambda s: (coefficient_scale * forward * s, coefficient_scale * backward * s)
+    return lambda strength: (
+        coefficient_scale * forward * strength,
+        coefficient_scale * backward * strength,
+    )
 
 
 def _draw_power_law(
@@ -299,7 +306,7 @@ def _draw_power_law(
         Function from the strength to gain and power.
     """
     peak = motion.peak
-    return lambda s: (float(peak**-s - 1), s)
+    return lambda strength: (float(peak**-strength - 1), strength)
 
 
 def _draw_rate_limit(
@@ -316,7 +323,7 @@ def _draw_rate_limit(
         Function from the strength to the maximum rate of the input.
     """
     peak = motion.peak
-    return lambda s: (float(peak / (0.8 * s)),)
+    return lambda strength: (float(peak / (0.8 * strength)),)
 
 
 def _draw_quadratic_friction(
@@ -336,7 +343,7 @@ def _draw_quadratic_friction(
     """
     peak = motion.peak
     square = float(coefficient_scale * rng.uniform(2.0, 6.0) / peak)
-    return lambda s: (0.5 * coefficient_scale * s, square * s)
+    return lambda strength: (0.5 * coefficient_scale * strength, square * strength)
 
 
 def _draw_position_friction(
@@ -361,7 +368,12 @@ def _draw_position_friction(
     angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 0.95)
     sine = coefficient_scale * share * float(np.sin(angle))
     cosine = coefficient_scale * share * float(np.cos(angle))
-    return lambda s: (coefficient_scale * (1 - share) * s, sine * s, cosine * s, period)
+    return lambda strength: (
+        coefficient_scale * (1 - share) * strength,
+        sine * strength,
+        cosine * strength,
+        period,
+    )
 
 
 def _draw_warm_up_friction(
@@ -382,7 +394,7 @@ def _draw_warm_up_friction(
     time_constant = max(float(motion.seconds * rng.uniform(0.2, 0.8)), 0.5)
     # At the median speed, the viscous part is at most as large as the Coulomb friction.
     viscous = float(coefficient_scale * rng.uniform(0.0, 1.0) / motion.speed)
-    return lambda s: (coefficient_scale * s, viscous * s, time_constant)
+    return lambda strength: (coefficient_scale * strength, viscous * strength, time_constant)
 
 
 def _draw_sensor_slip(
@@ -402,7 +414,7 @@ def _draw_sensor_slip(
     """
     # The slip happens between 15 and 85 % of the run.
     sign, instant = float(rng.choice([-1, 1])), float(rng.uniform(0.15, 0.85) * motion.seconds)
-    return lambda s: (sign * coefficient_scale * s, instant)
+    return lambda strength: (sign * coefficient_scale * strength, instant)
 
 
 def _draw_flexible_load(
@@ -426,7 +438,11 @@ def _draw_flexible_load(
     # Damping ratio, 1 to 30 %.
     ratio = float(np.exp(rng.uniform(np.log(0.01), np.log(0.3))))
     # The load has at most 95 % of the inertia.
-    return lambda s: (min(coefficient_scale * s, 0.95), float(np.clip(frequency, 6, 300)), ratio)
+    return lambda strength: (
+        min(coefficient_scale * strength, 0.95),
+        float(np.clip(frequency, 6, 300)),
+        ratio,
+    )
 
 
 def _draw_backlash(
@@ -443,7 +459,7 @@ def _draw_backlash(
         Function from the strength to the gap and the fraction of the inertia that is the load's.
     """
     share, travel = float(rng.uniform(0.2, 0.8)), motion.travel
-    return lambda s: (0.3 * travel * s, share)
+    return lambda strength: (0.3 * travel * strength, share)
 
 
 def _draw_hysteresis(
@@ -463,7 +479,7 @@ def _draw_hysteresis(
     """
     travel = motion.travel
     deflection = float(travel * np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
-    return lambda s: (coefficient_scale * s, deflection)
+    return lambda strength: (coefficient_scale * strength, deflection)
 
 
 def _draw_end_stop(
@@ -485,7 +501,7 @@ def _draw_end_stop(
     stop_position = float(np.quantile(motion.path, stop_quantile))
     # Loss of the stop: relative increase of its force per unit of speed, in s/m or s/rad.
     loss = float(rng.uniform(0.0, 0.4)) / (5.0 if motion.system == "pendulum" else 1.0)
-    return lambda s: (side * coefficient_scale * s, stop_position, loss)
+    return lambda strength: (side * coefficient_scale * strength, stop_position, loss)
 
 
 SHAPE_SAMPLERS: dict[str, Callable[..., CoefficientFunction]] = {
@@ -540,7 +556,7 @@ def _draw_friction_patch(motion: BaseMotion, rng: np.random.Generator) -> Coeffi
     low, high = np.quantile(motion.path, [0.1, 0.9])
     half_width = float((high - low) * rng.uniform(0.07, 0.15))
     centre = float(rng.uniform(low + half_width, high - half_width))
-    return lambda s: (_get_unit_force(motion) * s, centre, half_width)
+    return lambda strength: (_get_unit_force(motion) * strength, centre, half_width)
 
 
 def _get_unit_force(motion: BaseMotion) -> float:
@@ -560,7 +576,7 @@ def _draw_gust(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunct
     """
     duration, sign = float(rng.uniform(0.1, 0.3)), float(rng.choice([-1, 1]))
     start_times = _draw_onsets(motion, duration, rng)
-    return lambda s: (sign * _get_unit_force(motion) * s, duration, *start_times)
+    return lambda strength: (sign * _get_unit_force(motion) * strength, duration, *start_times)
 
 
 def _draw_growing_damping(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
@@ -573,7 +589,7 @@ def _draw_growing_damping(motion: BaseMotion, rng: np.random.Generator) -> Coeff
         rng: random numbers of the case.
     """
     max_growth = (0.1 if motion.system == "pendulum" else 5.0) / motion.seconds
-    return lambda s: (max_growth * s,)
+    return lambda strength: (max_growth * strength,)
 
 
 def _draw_soft_stop(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
@@ -592,7 +608,7 @@ def _draw_soft_stop(motion: BaseMotion, rng: np.random.Generator) -> Coefficient
     position = float(np.quantile(motion.path, rng.uniform(0.7, 0.85)))
     # Stiffness at strength 1, in N m/rad for the pendulum and in N/m for the slider.
     max_stiffness = 10.0 if motion.system == "pendulum" else 2000.0
-    return lambda s: (max_stiffness * s, position)
+    return lambda strength: (max_stiffness * strength, position)
 
 
 def _draw_updraft(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
@@ -610,7 +626,7 @@ def _draw_updraft(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFu
     # Half width of the column of rising air, in m.
     half_width = float(rng.uniform(0.3, 0.8))
     centre = float(rng.uniform(*np.quantile(positions, [0.1, 0.9])))
-    return lambda s: (10.0 * s, centre, half_width)
+    return lambda strength: (10.0 * strength, centre, half_width)
 
 
 def _draw_ball_gust(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
@@ -628,9 +644,9 @@ def _draw_ball_gust(motion: BaseMotion, rng: np.random.Generator) -> Coefficient
     """
     duration, angle = float(rng.uniform(0.1, 0.4)), rng.uniform(0, 2 * np.pi)
     start_times = _draw_onsets(motion, duration, rng)
-    return lambda s: (
-        20.0 * s * float(np.cos(angle)),
-        20.0 * s * float(np.sin(angle)),
+    return lambda strength: (
+        20.0 * strength * float(np.cos(angle)),
+        20.0 * strength * float(np.sin(angle)),
         duration,
         *start_times,
     )
@@ -644,7 +660,7 @@ def _draw_changing_restitution(motion: BaseMotion, rng: np.random.Generator) -> 
         rng: random numbers of the case.
     """
     sign = float(rng.choice([-1, 1]))
-    return lambda s: (sign * s / motion.seconds,)
+    return lambda strength: (sign * strength / motion.seconds,)
 
 
 def _draw_drag_layer(motion: BaseMotion, rng: np.random.Generator) -> CoefficientFunction:
@@ -659,7 +675,7 @@ def _draw_drag_layer(motion: BaseMotion, rng: np.random.Generator) -> Coefficien
     """
     # The layer ends at 55 to 80 % of the lowest height of release.
     height = float(min(s.initial["z"] for s in motion.scenarios) * rng.uniform(0.55, 0.8))
-    return lambda s: (2.0 * s, height)
+    return lambda strength: (2.0 * strength, height)
 
 
 UNMODELLED_SAMPLERS: dict[tuple[bool, str], Callable[..., CoefficientFunction]] = {

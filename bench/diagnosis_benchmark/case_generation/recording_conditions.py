@@ -452,7 +452,9 @@ class BenchmarkCase(Document):
                 return None
             effects[name] = coefficients
         # A lag of the input comes last: nonlinear input effects act on the command.
-        effects = dict(sorted(effects.items(), key=lambda pair: pair[0] == "input.lag"))
+        effects = {
+            name: effects[name] for name in sorted(effects, key=lambda name: name == "input.lag")
+        }
         beyond = compute_unexplained(effects)
         least = MIN_SIMPLER_RESIDUAL if self.kind == "single" else MIN_DISTINCT_SIZE
         if beyond is not None and beyond < least:

@@ -191,6 +191,7 @@ class NuisanceFitter:
         variant_count = 1 + count + state_count
         thetas = np.tile(theta, (runs, variant_count, 1))
         initial_states = np.tile(starts[:, None], (1, variant_count, 1))
+        # Variant 0 is unchanged; variants of theta follow, then those of the initial states.
         for i in range(count):
             thetas[:, 1 + i, i] += FINITE_DIFFERENCE_STEP * self.scales[i]
         for i in range(state_count):
@@ -381,6 +382,7 @@ def _rank_starts(
         thetas = [np.array([*base_fit.theta, *coefficients]) for coefficients in guesses]
         starts = [(_compute_residual(fit, observed, theta, base_fit), theta) for theta in thetas]
     else:
+        # An effect without a shape has one start.
         starts = [
             _estimate_linear_step(fit, observed, shape, base_fit)
             for shape in SHAPE_GRIDS.get(name, [()])

@@ -80,15 +80,15 @@ class _ForwardSelection(Diagnoser):
         effects.
 
         In each round, `candidates` are the models with one more effect, ordered by the criterion.
-        The best becomes the new model; candidates within the tolerance `near_limit` of it are its
-        alternatives (`alternatives`).
+        The best becomes the new model; candidates within the tolerance `near` of it are its
+        alternatives.
 
         Args:
             evidence: fitted base model and directions of the effects.
         """
         samples = int(evidence.observed_mask.sum())
         best = _add_refit(evidence, evidence.base.fit)
-        base_model, candidates = best, list[RefittedModel]()
+        base_model = best
         causes: list[tuple[str, tuple[str, ...]]] = []
         while len(causes) < MAX_EFFECTS and not self._is_sufficient(best, samples):
             candidates = [
@@ -98,17 +98,17 @@ class _ForwardSelection(Diagnoser):
             if not candidates:
                 break
             candidates.sort(key=lambda candidate: self.compute_criterion(candidate, samples))
-            if self.compute_criterion(candidates[0], samples) >= self.compute_criterion(
-                best, samples
-            ):
+            best_candidate, *other_candidates = candidates
+            lowest_criterion = self.compute_criterion(best_candidate, samples)
+            if lowest_criterion >= self.compute_criterion(best, samples):
                 break
-            near_limit = self.compute_criterion(candidates[0], samples) + self.near
+            # The last effect of a candidate is the one that was added.
             alternatives = [
                 candidate.fit.effects[-1]
-                for candidate in candidates[1:]
-                if self.compute_criterion(candidate, samples) <= near_limit
+                for candidate in other_candidates
+                if self.compute_criterion(candidate, samples) <= lowest_criterion + self.near
             ]
-            best = candidates[0]
+            best = best_candidate
             causes.append((best.fit.effects[-1], tuple(alternatives)))
         return self._make_answer(evidence, base_model, best, causes, samples)
 
@@ -315,14 +315,15 @@ def _choose_starts(
     Args:
         evidence: directions of the effects at the current model.
         current_fit: the current model.
-        column: the effect and its best directions, one per coefficient that is linear in (1).
+        column: the effect and its best directions, one per coefficient on which the change of the
+            residual depends linearly.
         residual: residual after parameters and initial states are projected out, (N,).
         effects: columns of all directions after this projection, (N, K).
     """
     evaluator, name = evidence.evaluator, column.effect
     probes = [evidence.sensitivity_directions.candidates[index] for index in column.places]
     bounds = compute_coefficient_bounds(evaluator, name)
-    sizes = np.linalg.lstsq(effects[:, list(column.places)], residual, rcond=1e-9)[0]
+    sizes, *_ = np.linalg.lstsq(effects[:, list(column.places)], residual, rcond=1e-9)
     starts = []
     for factor in (1.0,) if probes[0].is_single_size else (1.0, 0.3):
         start_coefficients = probes[0].coefficients.copy()

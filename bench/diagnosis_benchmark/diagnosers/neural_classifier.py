@@ -427,7 +427,7 @@ def _train_network(
                 )
             if validation_loss < best:
                 best = validation_loss
-                state = {k: v.clone() for k, v in network.state_dict().items()}
+                state = {name: array.clone() for name, array in network.state_dict().items()}
     return {name: tensor.numpy() for name, tensor in state.items()}
 
 
@@ -448,7 +448,9 @@ def _predict_probabilities(
     # Creating the network draws random weights; the global random generator is restored.
     with torch.random.fork_rng(devices=[]):
         network = _make_network(image.shape[1], classes)
-    network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in trained_arrays.items()})
+    network.load_state_dict(
+        {name: torch.from_numpy(np.array(array)) for name, array in trained_arrays.items()}
+    )
     network.eval()
     inputs, weights = _stack_with_mask([image])
     with torch.no_grad():

@@ -482,7 +482,7 @@ def compute_block_means(values: Array, count: int) -> Array:
         count: number of blocks.
     """
     edges = np.linspace(0, len(values), count + 1).astype(int)
-    return np.array([values[a:b].mean() for a, b in pairwise(edges.tolist())])
+    return np.array([values[start:end].mean() for start, end in pairwise(edges.tolist())])
 
 
 def compute_standard_error(values: Array) -> float:

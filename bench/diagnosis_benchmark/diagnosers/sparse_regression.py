@@ -167,7 +167,8 @@ class SequentialThresholdedLeastSquares(_SparseRegression):
         from pysindy import optimizers
 
         # Terms that equal a sum of others to six digits would get huge coefficients.
-        size = float(np.abs(np.linalg.lstsq(library, residual, rcond=1e-6)[0]).max())
+        coefficients, *_ = np.linalg.lstsq(library, residual, rcond=1e-6)
+        size = float(np.abs(coefficients).max())
         # The threshold of the best model is unknown, so it is varied over three decades.
         for threshold in size * np.geomspace(1.0, 1e-3, 16):
             model = optimizers.STLSQ(threshold=threshold, alpha=RIDGE_PENALTY * len(residual))
@@ -258,7 +259,7 @@ def _select_by_one_standard_error(
         ]
     )
     best = int(errors.mean(axis=1).argmin())
-    gain = errors[0] - errors[best]
+    gain = errors[0] - errors[best]  # over no terms, by block
     sigmas = float(gain.mean() / max(compute_standard_error(gain), 1e-12)) if best else 0.0
     if sigmas < MIN_IMPROVEMENT_STANDARD_ERRORS:
         return zero_model, sigmas

@@ -52,10 +52,9 @@ class WhitenessTest(Diagnoser):
         # The correlation is the root of the fraction of the sum of squares that a column explains.
         total = float(residual @ residual)
         correlated = {name: (gain / total) ** 0.5 for name, (gain, _) in best.items()}
-        order = sorted(correlated, key=lambda name: -correlated[name])
-        if not order or correlated[order[0]] < MIN_CORRELATION:
+        if max(correlated.values(), default=0.0) < MIN_CORRELATION:
             return Answer("unknown", p_value=p_value)
-        most_correlated, *other_effects = order
+        most_correlated, *other_effects = sorted(correlated, key=lambda name: -correlated[name])
         alternatives = [
             name
             for name in other_effects

@@ -155,21 +155,21 @@ def draw_effect_shape(
     }
     sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED_EFFECTS else 1.0
     if effect in _MAX_COEFFICIENTS:
-        return lambda s: (sign * _MAX_COEFFICIENTS[effect] * s,)
+        return lambda strength: (sign * _MAX_COEFFICIENTS[effect] * strength,)
     if effect in MOTION_SCALED_EFFECTS:
         return MOTION_SCALED_EFFECTS[effect](typical_scales, rng)
     if effect == "gravity.tilt":
         # An arm can be tilted along x and y, of which its motion in a plane shows only the first.
         tilt_along_y = (0.0,) if setting.system == "arm2" else ()
-        return lambda s: (TILT_AT_STRENGTH_ONE * sign * s, *tilt_along_y)
+        return lambda strength: (TILT_AT_STRENGTH_ONE * sign * strength, *tilt_along_y)
     command = setting.fitted_runs.commands[:, :, joint]
     max_command = float(np.abs(command).max())
     return {
-        "input.bias": lambda s: (sign * float(np.ptp(command)) / 2 * s,),
-        "input.deadband": lambda s: (max_command * s,),
+        "input.bias": lambda strength: (sign * float(np.ptp(command)) / 2 * strength,),
+        "input.deadband": lambda strength: (max_command * strength,),
         # Strength 0 limits the command at its peak, strength 1 at zero.
-        "input.saturation": lambda s: (max_command * (1 - s),),
-        "servo.deadband": lambda s: (DEADBAND_AT_STRENGTH_ONE * s,),
+        "input.saturation": lambda strength: (max_command * (1 - strength),),
+        "servo.deadband": lambda strength: (DEADBAND_AT_STRENGTH_ONE * strength,),
     }[effect]
 
 
@@ -190,7 +190,7 @@ def _make_force_drawer(
     ) -> CoefficientFunction:
         """Draw the effect from the typical scales of its joint; `rng` is not used."""
         coefficient_scale = 2.0 * typical["force"] / get_factor(typical)
-        return lambda s: (coefficient_scale * s,)
+        return lambda strength: (coefficient_scale * strength,)
 
     return draw_coefficients
 
@@ -212,7 +212,7 @@ def _draw_ripple(typical_scales: dict[str, float], rng: np.random.Generator) -> 
     sine, cosine = (
         2 * typical_scales["force"] * float(function(angle)) for function in (np.sin, np.cos)
     )
-    return lambda s: (sine * s, cosine * s, period)
+    return lambda strength: (sine * strength, cosine * strength, period)
 
 
 def _draw_stribeck(
@@ -231,9 +231,9 @@ def _draw_stribeck(
     # Additional friction at rest, in Coulomb frictions.
     extra = float(rng.uniform(2.0, 6.0))
     speed = typical_scales["speed"] * float(rng.uniform(0.15, 0.5))
-    return lambda s: (
-        STRIBECK_FORCE_SHARE * typical_scales["force"] * s,
-        STRIBECK_FORCE_SHARE * extra * typical_scales["force"] * s,
+    return lambda strength: (
+        STRIBECK_FORCE_SHARE * typical_scales["force"] * strength,
+        STRIBECK_FORCE_SHARE * extra * typical_scales["force"] * strength,
         speed,
     )
 
@@ -245,7 +245,9 @@ MOTION_SCALED_EFFECTS: dict[str, Callable[..., CoefficientFunction]] = {
     "force.ripple": _draw_ripple,
     "friction.coulomb": _make_force_drawer(lambda typical: 2.0),
     "friction.stribeck": _draw_stribeck,
-    "inertia.armature": lambda typical, rng: lambda s: (2.0 * typical["inertia"] * s,),
+    "inertia.armature": lambda typical, rng: (
+        lambda strength: (2.0 * typical["inertia"] * strength,)
+    ),
     "spring.linear": _make_force_drawer(lambda typical: typical["position"] + 0.05),
 }
 """Functions that draw the shape of an effect from the typical scales of its joint and a generator.
@@ -274,9 +276,9 @@ def _draw_unmodelled_cause(
         duration = float(rng.uniform(0.1, 0.3) * setting.seconds)
         start = float(rng.uniform(0.1, 0.6) * setting.seconds)
         sign = float(rng.choice([-1.0, 1.0]))
-        return lambda s: (2.0 * sign * force * s, start, duration)
+        return lambda strength: (2.0 * sign * force * strength, start, duration)
     path = setting.base_motion.q[:, :, joint]
     # Centre and half width of the region, in rad.
     centre = float(np.quantile(path, rng.uniform(0.3, 0.7)))
     half_width = float(np.ptp(path) * rng.uniform(0.08, 0.2))
-    return lambda s: (2.0 * force * s, centre, half_width)
+    return lambda strength: (2.0 * force * strength, centre, half_width)

@@ -129,10 +129,13 @@ def _list_wrong_answers(kind: str, system: str, effects: Effects) -> list[str]:
             for effect in EFFECTS_BY_MACHINE[system]
             for name in hidden_causes.list_effect_places(system, effect)
         ]
-    effect, at, place = next(iter(effects)).partition("@")
+    (hidden_effect,) = effects
+    effect, at, place = hidden_effect.partition("@")
     if effect != "friction.stribeck":
         return []
-    return [f"friction.coulomb{at}{place}", f"drag.linear{at}{place}" if at else "drag.quadratic"]
+    # Effects of a servo have no place, and its parameters absorb linear drag.
+    drag = f"drag.linear{at}{place}" if at else "drag.quadratic"
+    return [f"friction.coulomb{at}{place}", drag]
 
 
 class _ResidualGauge:
