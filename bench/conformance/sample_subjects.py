@@ -49,12 +49,12 @@ def simulate_toy_problem(points: Array) -> Array:
     With r_i = 0.5 + 0.6 p_i, channel 1 is the sum over i of cos(r_i t + 0.3 i) / i (1), channel 2
     that of exp(-r_i t) (1 + 0.1 i) (2).
     """
-    # index i of (1) and (2)
-    phases = np.arange(1, points.shape[1] + 1)
-    rates = 0.5 + 0.6 * points
-    waves = np.cos(rates[:, None, :] * SAMPLE_TIMES[:, None] + 0.3 * phases) / phases  # (1)
-    slopes = np.exp(-rates[:, None, :] * SAMPLE_TIMES[:, None]) * (1.0 + 0.1 * phases)  # (2)
-    return np.stack([waves.sum(axis=2), slopes.sum(axis=2)], axis=2)
+    i = np.arange(1, points.shape[1] + 1)
+    # Arrays (n, 40, dim), which are summed over the parameters.
+    cycles = (0.5 + 0.6 * points)[:, None, :] * SAMPLE_TIMES[:, None]
+    waves = np.cos(cycles + 0.3 * i) / i  # (1)
+    decays = np.exp(-cycles) * (1.0 + 0.1 * i)  # (2)
+    return np.stack([waves.sum(axis=2), decays.sum(axis=2)], axis=2)
 
 
 class ToyTrainingSimulator:

@@ -171,7 +171,7 @@ def _make_module_name(path: Path) -> str:
     name = f"simgap_plugin_{path.stem}"
     number = 1
     # Two files of the same name in different folders need different modules, because the source of
-    # a class is found by its module.
+    # a class is found by its module. A name without a module, or with that of this file, is free.
     while getattr(sys.modules.get(name), "__file__", str(path)) != str(path):
         number += 1
         name = f"simgap_plugin_{path.stem}_{number}"

@@ -498,6 +498,7 @@ def is_correct(rows: pd.DataFrame) -> pd.Series[bool]:
     of the library explains it.
     """
     is_right = rows["found_class"].astype(bool)
+    # `where` replaces the rows for which the condition does not hold.
     is_right = is_right.where(rows["kind"] != "clean", ~rows["alarm"].astype(bool))
     is_right = is_right.where(rows["kind"] != "foreign", _is_right(rows))
     return is_right & (rows["status"] == "done")

@@ -414,6 +414,8 @@ def _compute_loss(
     """
     import torch
 
+    # Shapes: B scenarios of m simulations, and n histories of k simulations in each scenario.
+    # Tokens are (B, n, k, d), aims (B, n, d), points (B, n, k, dim), proposals (B, n, k + 1, dim).
     simulations, target, parameters = parts
     tokens = (simulations @ w["seen.weight"])[:, histories.tried]
     aim = (target @ w["seen.weight"])[:, histories.targets]

@@ -197,17 +197,21 @@ def make_weighted_features(
     """Choose and scale inputs by how closely they follow the parameters.
 
     Within each scenario every candidate number is fitted as a linear function of the parameters
-    (1). A large residual of the fit (jumps, curvature, noise) means that the number is a poor
-    predictor, above all outside the training range; (2) and (3) give it a small weight. Each
-    parameter's weights are scaled to the same maximum, so that a parameter with strong effects does
-    not hide the others. A number that does not depend on the parameters but differs between
-    scenarios describes the scenario; its weight is (4).
+    (1). Each number then has two weights, of which the larger one counts; s is the strictness:
+
+    * For the parameters: its reliability is e / (e + s u), with the RMS e that a parameter explains
+      and the RMS u of the residual (2). A large residual (jumps, curvature, noise) means a poor
+      predictor, above all outside the training range. Each parameter's reliabilities are scaled to
+      the same maximum, so that a parameter with strong effects does not hide the others. The weight
+      is the square of the largest one (3).
+    * For the scenario: (b / (b + s w))^2, with the standard deviations b between and w within
+      scenarios (4). It is large if the number describes the scenario.
 
     Args:
         data: training simulations.
         points: number of points to which each run is resampled.
         max_inputs: maximum number of inputs, those with the largest weights; 0 for none.
-        strictness: factor s of the residual in (2) and (4).
+        strictness: factor s.
 
     Returns:
         The inputs; their mean square over the training data is 1.

@@ -258,7 +258,8 @@ def _draw_pendulum_conditions(
     """Draw parameters, channels and runs of a pendulum.
 
     Half of the pendulums have an input, and all if a hidden cause is visible only with one. A run
-    is drawn again until it swings by 0.25 to 2.8 rad: smaller motion shows little.
+    is drawn again until its largest angle without effects is 0.25 to 2.8 rad: smaller motion shows
+    little.
 
     Args:
         rng: random generator.
@@ -277,20 +278,17 @@ def _draw_pendulum_conditions(
     signal_form = str(rng.choice(["steps", "sine", "chirp"]))
     scenarios: list[Scenario] = []
     while len(scenarios) < runs:
-        inputs = (
-            # Amplitude in N m, and lowest and highest frequency in Hz.
-            {"u": rng.uniform(0.05, 0.2) * draw_input_signal(signal_form, times, rng, (0.3, 3.0))}
-            if driven
-            else {}
-        )
+        inputs = {}
+        if driven:
+            amplitude = rng.uniform(0.05, 0.2)  # N m
+            inputs["u"] = amplitude * draw_input_signal(signal_form, times, rng, hertz=(0.3, 3.0))
         # Initial rate in rad/s, and angle in rad.
         rate = rng.choice([0.0, rng.uniform(-5.0, 5.0)])
         start = {"q": rng.choice([-1, 1]) * rng.uniform(0.3, 2.5), "qd": rate}
         scenario = Scenario(times, start, inputs)
         swing = PENDULUM.simulate(np.array([[parameters["inertia"]]]), scenario)
-        if (
-            0.25 < np.abs(swing).max() < 2.8
-        ):  # beyond the top, the smallest force decides on which side it falls
+        # Beyond the top, the smallest force decides on which side it falls.
+        if 0.25 < np.abs(swing).max() < 2.8:
             scenarios.append(scenario)
     return parameters, channels, scenarios
 

@@ -414,7 +414,8 @@ class RegressionEvidence:
         # Position and velocity of the fitted motion, (T, 1).
         x = self.base.fit.simulated[run, :size, evaluator.channels.index(name)][:, None]
         v = np.gradient(x[:, 0], times)[:, None]
-        values = {c.name: c.value for c in evaluator.kind.constants}
+        # Constants of the simulator are replaced by those of the recording, then of the run.
+        values = {constant.name: constant.value for constant in evaluator.kind.constants}
         values |= {**evaluator.simulator.constant_values, **run_data.scenario.constants}
         constants = {key: np.full((size, 1), float(value)) for key, value in values.items()}
         theta = np.tile(self.base.fit.theta[: evaluator.system_parameter_count], (size, 1))

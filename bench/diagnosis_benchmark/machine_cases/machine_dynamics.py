@@ -94,7 +94,7 @@ class MachineDynamics(ABC):
         return has_friction
 
     def compute_friction_limit(self, q: Array, v: Array) -> Array:
-        """Compute the dry friction limit: the friction of a moving joint, the most at rest.
+        """Compute the dry friction limit: friction of a moving joint, maximum of a resting one.
 
         It is the sum of Coulomb friction, the Stribeck part that vanishes at speed, and a patch of
         friction in a region of one joint.
