@@ -16,10 +16,8 @@ from time import perf_counter
 from typing import Any
 
 from bench.benchmark.isolation.message_channel import (
-    MAX_STATE_BYTES,
     ProtocolError,
     pack_arrays,
-    unpack_arrays,
 )
 from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.isolation.tuner_processes import (
@@ -233,7 +231,7 @@ def _diagnose_isolated(
     """
     # Only the recording of a robot has further files: its model file.
     extra_modules = ("mujoco",) if request["beside"] else ()
-    child = _start_process(code, limits.memory, hidden, extra_modules)
+    child = start_diagnoser_process(code, limits.memory, hidden, extra_modules)
     try:
         if trained_arrays:
             deadline = perf_counter() + START_TIMEOUT_SECONDS
@@ -280,7 +278,7 @@ def _validate_answer(message: Any, limits: AnswerLimits) -> dict[str, Any]:
     return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
 
 
-def _start_process(
+def start_diagnoser_process(
     code: TunerSpec, memory: int, hidden: tuple[str, ...], extra_modules: tuple[str, ...] = ()
 ) -> IsolatedProcess:
     """Start the isolated process of a diagnoser from the fork server, and wait until it is ready.
@@ -305,45 +303,3 @@ def _start_process(
         child.end()
         raise
     return child
-
-
-def train_isolated(
-    code: TunerSpec, request: dict[str, Any], seconds: float, hidden: tuple[str, ...], trusted: bool
-) -> tuple[dict[str, Array], int, float]:
-    """Train a diagnoser for a system, in an isolated process unless it is trusted.
-
-    The process gets the request in a message of kind F, and answers with kind L: the trained arrays
-    and, as one more array, the number of simulations.
-
-    Args:
-        code: where its code is.
-        request: request with ``wanted``, ``system``, ``budget`` and ``seed``.
-        seconds: maximum time.
-        hidden: folders that the diagnoser must not read.
-        trusted: whether it runs in this process.
-
-    Returns:
-        The trained arrays, the number of simulations and the seconds used.
-
-    Raises:
-        RunEndedError: the training failed.
-    """
-    started_at = perf_counter()
-    if trusted:
-        arrays, used_simulations = diagnoser_process.train_diagnoser(request)
-        return dict(arrays), used_simulations, perf_counter() - started_at
-    child = _start_process(code, 0, hidden)
-    try:
-        deadline = started_at + seconds
-        child.send(b"F", json.dumps(request).encode(), deadline=deadline)
-        message = child.receive(MAX_STATE_BYTES, deadline)
-        try:
-            if message.kind != b"L":
-                raise ProtocolError("it has no training result")
-            trained_arrays = unpack_arrays(message.body)
-            used_simulations = int(trained_arrays.pop("simulations")[0])
-        except (ProtocolError, KeyError, ValueError) as error:
-            raise child.fail_with_protocol_error(f"{error}") from None
-        return trained_arrays, used_simulations, perf_counter() - started_at
-    finally:
-        child.end()

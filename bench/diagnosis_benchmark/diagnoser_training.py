@@ -7,11 +7,18 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from time import perf_counter
 from typing import Any, NamedTuple
 
+from bench.benchmark.isolation.message_channel import (
+    MAX_STATE_BYTES,
+    ProtocolError,
+    unpack_arrays,
+)
 from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.runner.code_digest import (
     compute_digest,
@@ -27,8 +34,10 @@ from bench.benchmark.runner.trained_weights import (
     write_weights,
 )
 from bench.core.random_streams import make_seed_words
-from bench.diagnosis_benchmark.case_evaluation import train_isolated
+from bench.diagnosis_benchmark import diagnoser_process
+from bench.diagnosis_benchmark.case_evaluation import start_diagnoser_process
 from sims.core.files import write_atomically
+from sims.core.simulator import Array
 
 CACHE_SUBFOLDER = "diagnosers"
 """Subfolder of the cache of trained weights."""
@@ -90,6 +99,48 @@ def train_or_load(
         lambda: train_isolated(code, training_request, seconds, hidden, trusted)
     )
     return write_weights(path, arrays, used_simulations, spent_seconds)
+
+
+def train_isolated(
+    code: TunerSpec, request: dict[str, Any], seconds: float, hidden: tuple[str, ...], trusted: bool
+) -> tuple[dict[str, Array], int, float]:
+    """Train a diagnoser for a system, in an isolated process unless it is trusted.
+
+    The process gets the request in a message of kind F, and answers with kind L: the trained arrays
+    and, as one more array, the number of simulations.
+
+    Args:
+        code: where its code is.
+        request: request with ``wanted``, ``system``, ``budget`` and ``seed``.
+        seconds: maximum time.
+        hidden: folders that the diagnoser must not read.
+        trusted: whether it runs in this process.
+
+    Returns:
+        The trained arrays, the number of simulations and the seconds used.
+
+    Raises:
+        RunEndedError: the training failed.
+    """
+    started_at = perf_counter()
+    if trusted:
+        arrays, used_simulations = diagnoser_process.train_diagnoser(request)
+        return dict(arrays), used_simulations, perf_counter() - started_at
+    child = start_diagnoser_process(code, 0, hidden)
+    try:
+        deadline = started_at + seconds
+        child.send(b"F", json.dumps(request).encode(), deadline=deadline)
+        message = child.receive(MAX_STATE_BYTES, deadline)
+        try:
+            if message.kind != b"L":
+                raise ProtocolError("it has no training result")
+            trained_arrays = unpack_arrays(message.body)
+            used_simulations = int(trained_arrays.pop("simulations")[0])
+        except (ProtocolError, KeyError, ValueError) as error:
+            raise child.fail_with_protocol_error(f"{error}") from None
+        return trained_arrays, used_simulations, perf_counter() - started_at
+    finally:
+        child.end()
 
 
 TRAINING_COSTS_FILE = "training.csv"

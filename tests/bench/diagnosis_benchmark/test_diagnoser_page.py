@@ -7,8 +7,12 @@ import pytest
 from scipy.stats import beta
 
 from bench.benchmark.problem.experiment import load_experiment
-from bench.diagnosis_benchmark.diagnoser_page import DiagnoserReportData, render_page
-from bench.diagnosis_benchmark.diagnoser_report import draw_chart_figures, draw_confusion_matrices
+from bench.diagnosis_benchmark.diagnoser_figures import (
+    DiagnoserReportData,
+    draw_chart_figures,
+    draw_confusion_matrices,
+)
+from bench.diagnosis_benchmark.diagnoser_page import render_page
 from bench.diagnosis_benchmark.diagnoser_training import read_training_costs
 from bench.diagnosis_benchmark.result_tables import (
     build_all_tables,
