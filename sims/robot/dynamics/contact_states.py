@@ -370,5 +370,6 @@ def _compute_cost(contacts: dict[_Key, _Contact], keys: list[_Key]) -> float:
     if not all(key in contacts for key in keys):
         return float("inf")
     residual = _compute_residual(contacts, contacts, keys)
-    falling = sum(not contacts[key].is_closed for key in keys) * 9.81 / ACCELERATION_TOLERANCE
+    open_count = sum(not contacts[key].is_closed for key in keys)
+    falling = open_count * 9.81 / ACCELERATION_TOLERANCE  # acceleration of gravity in m/s^2
     return float(residual @ residual + falling**2)

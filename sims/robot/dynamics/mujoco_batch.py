@@ -357,7 +357,8 @@ class MujocoBatch:
             floating_state: poses and velocities of floating bodies.
 
         Returns:
-            Initial positions and velocities (n, H) of the H joints in series; these are zero.
+            Initial positions and velocities (n, H) of the H joints in series; the velocities are
+            zero.
         """
         self.batch.reset(stage=0)
         qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")

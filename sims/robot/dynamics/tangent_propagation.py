@@ -324,6 +324,7 @@ class TangentModel:
         """
         with self._at.with_batch(mujoco_batch):
             ends, readings = self._at.step_displaced({}, acting)
+        # A state begins with the positions and the velocities of the E joints.
         velocities = slice(self._sizes.size, 2 * self._sizes.size)
         base_ends, _ = self._base_step
         difference = (ends - base_ends)[:, velocities] / change

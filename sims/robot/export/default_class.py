@@ -86,6 +86,7 @@ def _format_default_element(
         element: the joint or actuator.
         values: its values by MJCF attribute.
     """
+    # Most attributes are zero by default.
     class_values = {
         name: value
         for name, value in values.items()

@@ -119,6 +119,7 @@ def _check_actuator_table(
         )
     allowed = (*COMMON_ACTUATOR_KEYS, *GAIN_KEYS_BY_KIND[kind])
     toml_validation.check_known_names(f"entry of [{table_name}], of kind {kind}", table, allowed)
+    # The first gain is required; a motor has none.
     for key in GAIN_KEYS_BY_KIND[kind][:1]:
         if key not in table:
             raise InputError(

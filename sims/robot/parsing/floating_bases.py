@@ -70,9 +70,9 @@ def separate_floating_joints(
             )
         body, is_free = joint.parent, joint.type == mujoco.mjtJoint.mjJNT_FREE
         anchor = np.array(joint.pos)
-        compiled = model.body(body.name)
+        compiled_body = model.body(body.name)
         rotation = np.empty(9)
-        mujoco.mju_quat2Mat(rotation, compiled.quat)
+        mujoco.mju_quat2Mat(rotation, compiled_body.quat)
         # Columns of the transpose are the world's axes in the frame of the body.
         axes_in_body = rotation.reshape(3, 3).T
         spec.delete(joint)
@@ -80,7 +80,7 @@ def separate_floating_joints(
             slide = _add_joint(
                 body, f"{base}.{name}", mujoco.mjtJoint.mjJNT_SLIDE, axes_in_body[:, k]
             )
-            slide.ref = float(compiled.pos[k])
+            slide.ref = float(compiled_body.pos[k])
         for k, name in zip((2, 1, 0), ANGLES, strict=True):
             hinge = _add_joint(
                 body, f"{base}.{name}", mujoco.mjtJoint.mjJNT_HINGE, axes_in_body[:, k]

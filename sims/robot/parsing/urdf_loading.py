@@ -69,15 +69,14 @@ def repair_inertials(
             if find_children(link, "collision") and name not in fixed_links:
                 inferred_links.append(name)
             continue
+        inertial, *_ = inertials
         mass = get_link_mass(link)
         if not 0 <= mass < math.inf:
-            raise files.make_error(
-                inertials[0], f"link {truncate_text(name)}: its mass is {mass:g} kg"
-            )
-        if not find_children(inertials[0], "mass"):
-            SubElement(inertials[0], "mass", value="0")
-        tensors = find_children(inertials[0], "inertia")
-        tensor = tensors[0] if tensors else SubElement(inertials[0], "inertia")
+            raise files.make_error(inertial, f"link {truncate_text(name)}: its mass is {mass:g} kg")
+        if not find_children(inertial, "mass"):
+            SubElement(inertial, "mass", value="0")
+        tensors = find_children(inertial, "inertia")
+        tensor = tensors[0] if tensors else SubElement(inertial, "inertia")
         entries = [parse_number(tensor.get(key)) for key in TENSOR_ENTRIES]
         if not np.isfinite(entries).all():
             raise files.make_error(
