@@ -174,11 +174,12 @@ class ContactModel:
         contacts: dict[_Key, tuple[Array, float, bool]] = {}
         jacobians = np.zeros((2, 3, model.nv))
         # A field of all contacts is much faster to read than one contact after another.
-        every = data.contact
-        frames, points, dims = every.frame.reshape(-1, 3, 3), every.pos, every.dim.tolist()
-        distances, addresses = every.dist.tolist(), every.efc_address.tolist()
+        all_contacts = data.contact
+        frames, points = all_contacts.frame.reshape(-1, 3, 3), all_contacts.pos
+        dims, distances = all_contacts.dim.tolist(), all_contacts.dist.tolist()
+        addresses = all_contacts.efc_address.tolist()
         last_numbers: dict[tuple[int, int], int] = {}
-        for i, (first, second) in enumerate(every.geom.tolist()):
+        for i, (first, second) in enumerate(all_contacts.geom.tolist()):
             for jacobian, geom in zip(jacobians, (first, second), strict=True):
                 mujoco.mj_jac(model, data, jacobian, None, points[i], self._bodies[geom])
             rows = 3 if dims[i] > 1 else 1

@@ -349,9 +349,10 @@ class MeasuredLinear(RunLinearisation):
 
     @cached_property
     def step_errors(self) -> Array:
-        """Discretisation errors (T - 1, Z) of each interval between samples.
+        """Discretisation errors (T - 1, Z) of the state at the end of each interval between samples.
 
-        They are zero for the Runge-Kutta method, whose order is high.
+        They are zero for the Runge-Kutta method, whose order is high. For others they are estimated
+        by steps of half the length, at the linearisation points.
         """
         simulator, tangent = self._simulator, self._tangent
         if forces_are_at_step_end(simulator.make_linearisation_batch(self._work.acting).model):

@@ -123,6 +123,9 @@ def _make_robot(
         actuators: actuators that the recording adds, by name.
         engine: time step and integrator that the recording sets.
         warnings: list to which MuJoCo's warnings are appended while it compiles.
+
+    Raises:
+        InputError: the file cannot be repaired, or the additions are invalid.
     """
     # 1. XML.
     source, notes = str(files.path), element_names.rename_invalid_names(root)
