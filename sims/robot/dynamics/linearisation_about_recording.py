@@ -349,7 +349,7 @@ class MeasuredLinear(RunLinearisation):
 
     @cached_property
     def step_errors(self) -> Array:
-        """Discretisation errors (T - 1, Z) of the state at the end of each interval between samples.
+        """Discretisation errors (T - 1, Z) of the state, at the end of each sample interval.
 
         They are zero for the Runge-Kutta method, whose order is high. For others they are estimated
         by steps of half the length, at the linearisation points.
