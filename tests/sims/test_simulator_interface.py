@@ -12,9 +12,9 @@ from sims.core.simulator import (
     Parameter,
     Scenario,
     Simulator,
-    UnitCube,
     apply_parameter_changes,
 )
+from sims.core.unit_cube import UnitCube
 
 LINEAR = Parameter("stiffness", "N/m", 3.0, (-1.0, 4.0), (0.0, 2.0))
 LOG = Parameter("inertia", "kg*m^2", 0.01, (1e-3, 1e-1), (1e-3, 1e-2), log=True)

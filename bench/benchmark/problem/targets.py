@@ -21,7 +21,8 @@ from bench.benchmark.problem.experiment import Experiment, FixedOrRange
 from bench.benchmark.problem.recording_observations import ObservedRuns, RecordedRuns
 from bench.core.input_signals import evaluate_signal
 from bench.core.random_streams import TargetStreams
-from sims.core.simulator import Array, Channel, InputError, Scenario, Simulator, UnitCube
+from sims.core.simulator import Array, Channel, InputError, Scenario, Simulator
+from sims.core.unit_cube import UnitCube
 
 _CUBE_CORNERS = np.array([[0.0], [1.0]])
 """Opposite corners of the unit cube, for any dimension."""

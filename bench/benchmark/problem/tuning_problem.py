@@ -29,10 +29,10 @@ from sims.core.simulator import (
     InputError,
     Scenario,
     Simulator,
-    UnitCube,
     apply_parameter_changes,
     make_unknown_name_error,
 )
+from sims.core.unit_cube import UnitCube
 
 
 class TuningProblem:

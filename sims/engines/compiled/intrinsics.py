@@ -1,4 +1,4 @@
-"""Functions that exist in compiled code only; `kernel_build` replaces these declarations."""
+"""Functions that exist in compiled code only: declarations, and their definitions for numba."""
 
 from __future__ import annotations
 
@@ -49,3 +49,60 @@ def call_external(address: int, part: int, w: int) -> None:
         w: number of slots in use.
     """
     raise NotImplementedError
+
+
+def make_intrinsics(numba: Any) -> dict[str, Any]:
+    """Return the compiled versions of the functions of this module, by name.
+
+    An intrinsic is a function whose LLVM code is generated here. The compiled code uses them to
+    read arrays of other libraries, and to call Python through a C callback.
+    """
+    from llvmlite import ir
+    from numba.np.unsafe.ndarray import to_fixed_tuple
+
+    types = numba.types
+    word = ir.IntType(64)
+
+    def make_pointer_function(kind: Any, target: Any) -> Any:
+        """Make a numba function that converts an integer address to a pointer.
+
+        `kind` is the type of the numbers for numba, and `target` the same type for LLVM.
+        """
+
+        def to_pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
+            """Return the types of the conversion for numba, and the generator of its LLVM code."""
+
+            def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+                return builder.inttoptr(values[0], target.as_pointer())
+
+            return types.CPointer(kind)(types.int64), generate
+
+        return numba.extending.intrinsic(to_pointer)
+
+    def call_external(context: Any, address: Any, part: Any, w: Any) -> Any:  # noqa: ARG001
+        """Call the function at an address with two integers, from compiled code (numba intrinsic).
+
+        It returns the types for numba, and a function that generates the LLVM code.
+
+        Args:
+            context: typing context of numba.
+            address: type of the address.
+            part: type of the first integer.
+            w: type of the second integer.
+        """
+
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+            function = ir.FunctionType(ir.VoidType(), [word, word])
+            builder.call(builder.inttoptr(values[0], function.as_pointer()), values[1:])
+            return context.get_dummy_value()
+
+        return types.void(types.int64, types.int64, types.int64), generate
+
+    return {
+        "carray": numba.carray,
+        "to_fixed_tuple": to_fixed_tuple,
+        "call_external": numba.extending.intrinsic(call_external),
+        "to_int_pointer": make_pointer_function(types.int64, word),
+        "to_short_pointer": make_pointer_function(types.int32, ir.IntType(32)),
+        "to_real_pointer": make_pointer_function(types.float64, ir.DoubleType()),
+    }

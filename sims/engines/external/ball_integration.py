@@ -46,12 +46,8 @@ import numpy as np
 from sims.core.effect import Contact
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
-from sims.engines.external.external_engine import (
-    ElementForces,
-    ElementWork,
-    Trajectory,
-    Vector,
-)
+from sims.engines.external.element_forces import ElementForces, Vector
+from sims.engines.external.external_engine import ElementWork, Trajectory
 from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, SHORT_FLIGHT_SECONDS
 
 BallState = tuple[Vector, Vector]

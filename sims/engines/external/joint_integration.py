@@ -27,11 +27,8 @@ from typing import Protocol
 
 import numpy as np
 
-from sims.engines.external.external_engine import (
-    ElementForces,
-    ElementWork,
-    Trajectory,
-)
+from sims.engines.external.element_forces import ElementForces
+from sims.engines.external.external_engine import ElementWork, Trajectory
 
 VELOCITY_STEP = 1e-3
 """Velocity difference (m/s or rad/s) used to compute the slope of the force."""

@@ -24,13 +24,8 @@ from sims.engines.external.external_engine import (
     integrate_batch,
     resolve_time_step,
 )
-from sims.engines.external.mujoco_bodies import (
-    CompiledWorld,
-    MujocoBall,
-    MujocoJoint,
-    MujocoSoftBall,
-    write_joint_model,
-)
+from sims.engines.external.mujoco_balls import MujocoBall, MujocoSoftBall
+from sims.engines.external.mujoco_world import CompiledWorld, MujocoJoint, write_joint_model
 from sims.engines.external.world_interface import (
     MujocoWorldModule,
     check_one_coordinate,
