@@ -36,11 +36,11 @@ from sims.engines.compiled.data_layout import (
     MASS,
     OUT_LIMIT,
     Block,
+    FloatArray,
     T,
     V,
     X,
 )
-from sims.engines.compiled.events import compute_norm
 from sims.engines.compiled.interpreter import nan_maximum, run_part
 
 
@@ -352,3 +352,33 @@ def compute_frictionless_acceleration(block: Block, row_of_result: int) -> None:
         for i in range(block.w):
             if block.n[IS_RESTING, i] != 0:
                 a[last_row, i] = nan_maximum(block.r[block.out[d - 1], i], 0.0) / a[MASS, i]
+
+
+def dot(a: FloatArray, first_vector: int, second_vector: int, d: int, i: int) -> float:
+    """Return the inner product of two vectors.
+
+    Args:
+        a: (rows, slots) numbers; a vector is in consecutive rows of one column.
+        first_vector: first row of the first vector.
+        second_vector: first row of the second vector.
+        d: number of dimensions.
+        i: index of the slot, the column of the batch element.
+    """
+    total = a[first_vector, i] * a[second_vector, i]
+    for k in range(1, d):
+        total += a[first_vector + k, i] * a[second_vector + k, i]
+    return total  # type: ignore[no-any-return]
+
+
+def compute_norm(a: FloatArray, first_vector: int, d: int, i: int) -> float:
+    """Return the magnitude of a vector.
+
+    Args:
+        a: (rows, slots) numbers; a vector is in consecutive rows of one column.
+        first_vector: first row of the vector.
+        d: number of dimensions.
+        i: index of the slot, the column of the batch element.
+    """
+    if d == 1:
+        return abs(a[first_vector, i])  # type: ignore[no-any-return]
+    return np.sqrt(dot(a, first_vector, first_vector, d, i))  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""Time, inputs and recorded states of a batch element in its slot of a block."""
+"""Load batch elements into the slots of a block, set clocks and inputs, and record their states."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from sims.engines.compiled.data_layout import (
     V,
     X,
 )
+from sims.engines.compiled.interpreter import nan_maximum
 
 
 def load_element(block: Block, i: int, order_index: int) -> None:
@@ -172,3 +173,29 @@ def next_step(block: Block, i: int) -> None:
     a[T, i] = a[STEP_START, i]
     a[REMAINING_TIME, i] = block.steps[row, step] if step < block.steps.shape[1] else 0.0
     set_inputs(block, i)
+
+
+def shift_time(block: Block, i: int, seconds: float) -> float:
+    """Correct the element's clock at an event, by at most one step, and return the correction.
+
+    A step that should end at an event ends there only approximately. The caller computes by how
+    much, and moves the state by the same time. Later steps have correspondingly less time left.
+
+    Args:
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
+        i: index of the slot, the column of the batch element.
+        seconds: time correction in seconds; NaN counts as zero.
+
+    Returns:
+        The applied correction in seconds.
+    """
+    step = block.a[MAX_STEP, i]
+    if seconds != seconds:  # NaN
+        seconds = 0.0
+    seconds = min(max(seconds, -step), step)
+    block.a[T, i] += seconds
+    block.a[REMAINING_TIME, i] = nan_maximum(block.a[REMAINING_TIME, i] - seconds, 0.0)
+    return seconds

@@ -31,10 +31,8 @@ from sims.engines.compiled.data_layout import (
     BOUNCES,
     CONSTANTS,
     DIMENSIONS,
-    ELEMENT,
     EVENT_DELAY,
     F1,
-    FLOOR,
     HAS_FORCES,
     HAS_FRICTION,
     IN_T,
@@ -42,7 +40,6 @@ from sims.engines.compiled.data_layout import (
     IN_X,
     IS_IDLE,
     IS_RESTING,
-    IS_STEP_START,
     K1,
     K2,
     K3,
@@ -54,7 +51,6 @@ from sims.engines.compiled.data_layout import (
     ORDER_INDEX,
     PENDING_EVENT,
     REMAINING_TIME,
-    STEP_INDEX,
     STEP_LIMIT,
     Block,
     H,
@@ -67,7 +63,8 @@ from sims.engines.compiled.element_loading_and_recording import (
     next_step,
     record_and_check_remaining,
 )
-from sims.engines.compiled.events import detect_and_schedule_event, handle_event, handle_impact
+from sims.engines.compiled.events import detect_and_schedule_event, handle_event
+from sims.engines.compiled.ground_impacts import resolve_initial_ground_contact
 from sims.engines.compiled.interpreter import nan_maximum, run_part
 from sims.engines.compiled.step_size import (
     choose_step_divisions,
@@ -138,55 +135,6 @@ def step_elements(block: Block) -> None:
         for i in range(block.w):
             if block.n[IS_IDLE, i] == 0:
                 accept_or_retry(block, i)
-
-
-def resolve_initial_ground_contact(block: Block) -> None:
-    """Apply ground contact at the initial state of newly loaded elements.
-
-    Elements that start inside the ground are moved to its surface. Of those on the ground, the ones
-    that move down have an impact, and the ones without vertical speed rest. The last coordinate is
-    the height.
-
-    Args:
-        block: force program, simulations (elements) of a batch, and their buffers. Each of the
-            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
-            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
-    """
-    a = block.a
-    n = block.n
-    d = block.flags[DIMENSIONS]
-    height_row = X + d - 1
-    rate_row = V + d - 1
-    any_on_ground = False
-    for i in range(block.w):
-        if is_newly_loaded(block, i):
-            floor = block.ground[FLOOR, n[ELEMENT, i]]
-            a[height_row, i] = nan_maximum(a[height_row, i], floor)
-            any_on_ground |= a[height_row, i] <= floor and a[rate_row, i] <= 0.0
-    if not any_on_ground:
-        return
-    # `handle_impact` needs the acceleration before the impact, which `begin_step` writes to K1.
-    evaluate_forces(block)
-    begin_step(block)
-    for i in range(block.w):
-        if is_newly_loaded(block, i):
-            floor = block.ground[FLOOR, n[ELEMENT, i]]
-            if a[height_row, i] <= floor and a[rate_row, i] < 0.0:
-                handle_impact(block, i, K1)
-            elif a[height_row, i] <= floor and a[rate_row, i] == 0.0:
-                n[IS_RESTING, i] = 1
-
-
-def is_newly_loaded(block: Block, i: int) -> bool:
-    """Return whether a slot holds an element at the beginning of its run.
-
-    Args:
-        block: buffers of the elements that are integrated together.
-        i: index of the slot.
-    """
-    n = block.n
-    return bool(n[ORDER_INDEX, i] >= 0 and n[STEP_INDEX, i] == 0 and n[IS_STEP_START, i] == 1)
 
 
 def try_step(block: Block) -> None:

@@ -1,9 +1,8 @@
-"""Events of one element: impacts, standstill, break-away and step-size control.
+"""Events of one element: impacts, standstill and break-away.
 
 A step that contains an event is rejected and repeated up to the event time, which is estimated by
 interpolation and corrected to second order afterwards; the state is changed there, and the rest of
-the step follows. `i` is the index of a slot. Equation (7) is that of `element_stepping`, equations
-of impacts are those of `sims.engines.ground_contact`.
+the step follows (impacts: `ground_impacts`). `i` is the index of a slot.
 
 For a quantity with value p and rate r at the beginning of a step of length h, and value q at its
 end, the parabola through these values is
@@ -27,6 +26,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.engines.compiled.accelerations import compute_norm, dot
 from sims.engines.compiled.data_layout import (
     BOUNCES,
     BREAK_AWAY,
@@ -39,38 +39,24 @@ from sims.engines.compiled.data_layout import (
     EXCESS_BEFORE,
     FLOOR,
     FRICTION_COORDINATE_COUNT,
-    GROUND_FRICTION,
     HAS_FRICTION,
     IMPACT,
-    IMPACTS,
-    IN_E,
-    IN_MU,
-    IN_SPEED,
-    IS_RESTING,
     IS_STICKING,
     K1,
     K4,
     MAX_STEP,
-    MIN_REMAINING_SHARE,
     NEXT_V,
     NEXT_X,
     NO_EVENT,
-    OUT_E,
-    OUT_MU,
     PENDING_EVENT,
-    REMAINING_TIME,
-    RESTITUTION,
-    SHORT_FLIGHT_COUNT,
     STANDSTILL,
     Block,
-    FloatArray,
     H,
-    T,
     V,
     X,
 )
-from sims.engines.compiled.interpreter import nan_maximum, run_instructions
-from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, SHORT_FLIGHT_SECONDS
+from sims.engines.compiled.element_loading_and_recording import shift_time
+from sims.engines.compiled.ground_impacts import handle_impact
 
 MAX_EVENTS_PER_STEP = 256
 """Maximum number of events in one step of one element; further events are ignored."""
@@ -78,36 +64,6 @@ BREAK_AWAY_TIME_TOLERANCE = 1e-4
 """Time tolerance of break-away, as a fraction of a step."""
 REST_SPEED_SHARE = 1e-9
 """Fraction of the speed change in a full step below which a stopped element is at rest."""
-
-
-def dot(a: FloatArray, first_vector: int, second_vector: int, d: int, i: int) -> float:
-    """Return the inner product of two vectors.
-
-    Args:
-        a: (rows, slots) numbers; a vector is in consecutive rows of one column.
-        first_vector: first row of the first vector.
-        second_vector: first row of the second vector.
-        d: number of dimensions.
-        i: index of the slot, the column of the batch element.
-    """
-    total = a[first_vector, i] * a[second_vector, i]
-    for k in range(1, d):
-        total += a[first_vector + k, i] * a[second_vector + k, i]
-    return total  # type: ignore[no-any-return]
-
-
-def compute_norm(a: FloatArray, first_vector: int, d: int, i: int) -> float:
-    """Return the magnitude of a vector.
-
-    Args:
-        a: (rows, slots) numbers; a vector is in consecutive rows of one column.
-        first_vector: first row of the vector.
-        d: number of dimensions.
-        i: index of the slot, the column of the batch element.
-    """
-    if d == 1:
-        return abs(a[first_vector, i])  # type: ignore[no-any-return]
-    return np.sqrt(dot(a, first_vector, first_vector, d, i))  # type: ignore[no-any-return]
 
 
 def find_event_time(value: float, rate: float, end_value: float, h: float) -> float:
@@ -247,157 +203,6 @@ def handle_event(block: Block, i: int) -> None:
     # Break-away needs no action: the next step finds that the element slips.
     block.a[EVENT_DELAY, i] = np.inf
     block.n[PENDING_EVENT, i] = NO_EVENT
-
-
-def shift_time(block: Block, i: int, seconds: float) -> float:
-    """Correct the element's clock at an event, by at most one step, and return the correction.
-
-    A step that should end at an event ends there only approximately. The caller computes by how
-    much, and moves the state by the same time. Later steps have correspondingly less time left.
-
-    Args:
-        block: force program, simulations (elements) of a batch, and their buffers. Each of the
-            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
-            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
-        i: index of the slot, the column of the batch element.
-        seconds: time correction in seconds; NaN counts as zero.
-
-    Returns:
-        The applied correction in seconds.
-    """
-    step = block.a[MAX_STEP, i]
-    if seconds != seconds:  # NaN
-        seconds = 0.0
-    seconds = min(max(seconds, -step), step)
-    block.a[T, i] += seconds
-    block.a[REMAINING_TIME, i] = nan_maximum(block.a[REMAINING_TIME, i] - seconds, 0.0)
-    return seconds
-
-
-def handle_impact(block: Block, i: int, k: int) -> None:
-    """Apply an impact with the ground, which the element has nearly reached.
-
-    First the element moves exactly to the ground: with its height d above the ground, the rate r of
-    d and the upward acceleration a, the impact is -d / r (1 + d a / (2 r^2)) seconds away (10).
-    Then its velocity becomes that of the rebound.
-
-    Args:
-        block: force program, simulations (elements) of a batch, and their buffers. Each of the
-            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
-            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
-        i: index of the slot, the column of the batch element.
-        k: first row of the acceleration before the impact.
-    """
-    a = block.a
-    d = block.flags[DIMENSIONS]
-    floor = block.ground[FLOOR, block.n[ELEMENT, i]]
-    # The last coordinate is the height.
-    height_row = X + d - 1
-    rate_row = V + d - 1
-    upward_acceleration = a[k + d - 1, i]
-    rate = a[rate_row, i]
-    correction = 0.0
-    if rate < 0.0:
-        correction = (floor - a[height_row, i]) / rate
-        correction *= 1.0 - 0.5 * correction * upward_acceleration / rate  # (10)
-    correction = shift_time(block, i, correction)
-    for j in range(d):
-        acceleration = a[k + j, i]
-        a[X + j, i] += correction * (a[V + j, i] + 0.5 * correction * acceleration)
-        a[V + j, i] += correction * acceleration
-    # Exactly on the ground and not moving up, otherwise the next step would contain the same
-    # impact.
-    a[height_row, i] = floor
-    a[rate_row, i] = clip_to_non_positive(a[rate_row, i])
-    compute_rebound_velocity(block, i, upward_acceleration)
-
-
-def clip_to_non_positive(rate: float) -> float:
-    """Return the rate if it is negative, otherwise zero; NaN stays NaN."""
-    return rate if rate <= 0.0 or rate != rate else 0.0
-
-
-def compute_rebound_velocity(block: Block, i: int, upward_acceleration: float) -> None:
-    """Set the velocity after an impact, from restitution and friction with effects.
-
-    With restitution e, friction coefficient mu and normal speed v, the rebound speed is e v, and
-    the tangential speed decreases by mu (1 + e) v, but not below a share that the ground leaves.
-    A ball whose bounces are over comes to rest, and loses the tangential speed of all remaining
-    impacts at once.
-
-    Args:
-        block: force program, simulations (elements) of a batch, and their buffers. Each of the
-            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
-            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
-        i: index of the slot, the column of the batch element.
-        upward_acceleration: upward acceleration before the impact; negative under gravity.
-    """
-    a = block.a
-    r = block.r
-    d = block.flags[DIMENSIONS]
-    rows = block.rows
-    element = block.n[ELEMENT, i]
-    rate_row = V + d - 1
-    speed = abs(a[rate_row, i])
-    # The program runs on all slots up to this one; the results of the others are not used.
-    width = i + 1
-    for s in range(width):
-        r[rows[IN_E], s] = block.ground[RESTITUTION, element]
-        r[rows[IN_MU], s] = block.ground[GROUND_FRICTION, element]
-        r[rows[IN_SPEED], s] = speed
-    run_instructions(block.code, block.ends[IMPACTS], block.ends[IMPACTS + 1], r, width)
-    restitution = r[rows[OUT_E], i]
-    friction = r[rows[OUT_MU], i]
-    rebound_speed = restitution * speed
-    lost_speed = friction * (1.0 + restitution) * speed
-    if count_bounce_and_check_end(block, i, rebound_speed, -upward_acceleration):
-        if restitution < 1.0:
-            # Sum of the geometric series of all further impacts, whose speeds fall by e each.
-            lost_speed += friction * (1.0 + restitution) * rebound_speed / (1.0 - restitution)
-        rebound_speed = 0.0
-        block.n[IS_RESTING, i] = 1
-    if friction > 0.0:
-        square = 0.0
-        for j in range(d - 1):
-            square += a[V + j, i] * a[V + j, i]
-        # The root of a square would be rounded.
-        tangential_speed = abs(a[V, i]) if d == 2 else np.sqrt(square)
-        share = 1.0 - lost_speed / (tangential_speed if tangential_speed > 0.0 else 1.0)
-        # The ground leaves at least this share, such as where the body begins to roll.
-        remaining_share = nan_maximum(share, block.ground[MIN_REMAINING_SHARE, element])
-        for j in range(d - 1):
-            a[V + j, i] *= remaining_share
-    a[rate_row, i] = rebound_speed
-
-
-def count_bounce_and_check_end(
-    block: Block, i: int, rebound_speed: float, downward_acceleration: float
-) -> bool:
-    """Count short flights in a row, and return whether bouncing is finished after this impact.
-
-    Without this, a ball would bounce infinitely often in finite time. Bouncing ends at a flight
-    shorter than `MIN_FLIGHT_SECONDS`, or after more than `MAX_SHORT_FLIGHTS` in a row that are
-    shorter than `SHORT_FLIGHT_SECONDS`. Without downward acceleration, the element flies away.
-
-    Args:
-        block: force program, simulations (elements) of a batch, and their buffers. Each of the
-            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
-            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
-        i: index of the slot, the column of the batch element.
-        rebound_speed: upward speed after the impact.
-        downward_acceleration: downward acceleration.
-    """
-    if not downward_acceleration > 0.0:
-        block.n[SHORT_FLIGHT_COUNT, i] = 0
-        return False
-    flight_seconds = 2.0 * rebound_speed / downward_acceleration
-    count = block.n[SHORT_FLIGHT_COUNT, i] + 1 if flight_seconds < SHORT_FLIGHT_SECONDS else 0
-    block.n[SHORT_FLIGHT_COUNT, i] = count
-    return bool(flight_seconds < MIN_FLIGHT_SECONDS or count > MAX_SHORT_FLIGHTS)
 
 
 def handle_standstill(block: Block, i: int) -> None:

@@ -1,4 +1,7 @@
-"""Step-size selection from stiffness and damping of the motion, for the elements of one block.
+"""Step sizes of the elements of one block: from stiffness and damping, and after nonlinear steps.
+
+Before the integration, steps are divided for stiff motion. Later, a step whose forces are too
+nonlinear is rejected and shortened (`shorten_if_nonlinear`, by (7) of `element_stepping`).
 
 At the initial state, and at rest at zero, the change of the forces with a small change of position
 and of velocity is computed for some steps of the run. For x'' = -w^2 x - c x', the fourth-order
@@ -16,7 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.engines.compiled.accelerations import evaluate_forces
+from sims.engines.compiled.accelerations import compute_norm, dot, evaluate_forces
 from sims.engines.compiled.data_layout import (
     CONSTANTS,
     DIMENSIONS,
@@ -50,7 +53,7 @@ from sims.engines.compiled.data_layout import (
     X,
 )
 from sims.engines.compiled.element_loading_and_recording import load_element
-from sims.engines.compiled.events import compute_norm, dot, has_no_pending_event
+from sims.engines.compiled.events import has_no_pending_event
 from sims.engines.compiled.interpreter import nan_maximum, run_part
 
 MAX_PHASE_PER_STEP = 0.07
