@@ -212,7 +212,7 @@ class SupplySag(Force):
             moment: state snapshot of L batch elements.
         """
         drive, _ = moment.sides
-        relative_drop = np.maximum(c[0], 0.0) * moment.drawn
+        relative_drop = np.maximum(c[0], 0.0) * moment.drawn  # c D
         return moment.along_primary(-drive * relative_drop / (1.0 + relative_drop))  # (1), (2)
 
 

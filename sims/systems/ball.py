@@ -77,7 +77,7 @@ class BallSystem(System):
         return np.concatenate([np.zeros((len(moment.x), 2)), -moment.gravity], axis=1)
 
     def push(self, moment: StateSnapshot, axis: Literal["x", "y"]) -> Array:
-        """Return a unit vector (L, D) along a horizontal axis.
+        """Return the force per unit mass of 1 m/s^2 along a horizontal axis, a unit vector (L, D).
 
         Shapes: L batch elements, D coordinates.
 

@@ -76,7 +76,8 @@ def build_native(client: int, constants: Mapping[str, float], settings: Mapping[
     Args:
         client: Bullet client of an empty world.
         constants: constants of the system by name.
-        settings: settings of the engine by name.
+        settings: ``lateral_friction`` of both bodies, ``plane_restitution``, and the air damping
+            ``linear_damping`` in 1/s.
     """
     pybullet = bullet_world.import_pybullet()
     ground, ball = _create_ground_and_ball(client, constants)

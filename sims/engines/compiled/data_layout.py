@@ -282,6 +282,7 @@ def check_block(block: Block) -> None:
         register_counts != (d, sizes["u"], sizes["p"])
         or (sizes["y"], sizes["z"]) != record_sizes
         or (sizes["q"], sizes["a"], sizes["n"]) != (11, NUMBER_ROW_COUNT, STATE_ROW_COUNT)
+        # Inputs and steps are those of each element, or the same for all.
         or not {sizes["j"], sizes["k"]} <= {1, elements}
         or not (1 <= block.w <= sizes["w"] and 1 <= d <= MAX_COORDINATES and sizes["s"] and steps)
         or not 0 <= block.order.min() <= block.order.max() < elements

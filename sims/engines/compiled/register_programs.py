@@ -126,9 +126,11 @@ class PreparedProgram:
         self._error: BaseException | None = None
         # Evaluators by the number of slots in use, whose inputs are views of the registers.
         self._evaluators: dict[int, Sequence[Evaluator]] = {}
+        # The registers of constants follow those of the inputs.
         first = program.function.input_ends[-1]
         self.r[first : first + program.constants.size] = program.constants[:, None]
         if not program.is_traced:
+            # One instruction for each part. The attribute keeps the callback alive.
             self._callback = _Callback(self._evaluate_part)
             address = ctypes.cast(self._callback, ctypes.c_void_p).value
             self.code = np.array(

@@ -243,13 +243,12 @@ class BallRollout:
 
         The engine's velocity belongs to half a step before the position, so it depends on the step.
         """
-        # The velocity half a step earlier depends on the step size.
         if step != self.step:
             self._ball.set_step(step)
             self.step = step
             self.w = None
         if self.w is None:
-            # Equation (1) backwards, from the previous step.
+            # The velocity half a step earlier: w = v - h/2 a.
             half_step = 0.5 * step
             x, y, z = self.v
             ax, ay, az = self.a
