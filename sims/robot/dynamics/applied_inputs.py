@@ -290,6 +290,9 @@ def _group_by_active_effects(
     is_active = np.array([(c != 0).any(axis=(0, 2)) for _, c in input_effects], dtype=bool).reshape(
         -1, n
     )
+    # Most runs have no input effect, and `np.unique` would take longer than the rest.
+    if not is_active.any():
+        return
     # Each distinct column is one combination of effects.
     combinations, combination_of_element = np.unique(is_active, axis=1, return_inverse=True)
     for number, combination in enumerate(combinations.T):
