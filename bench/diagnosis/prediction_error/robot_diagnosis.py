@@ -27,13 +27,26 @@ from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_ga
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit, assess_residual_size
-from bench.diagnosis.search.verdict_rules import DiagnosisState, decide_verdict, is_unexplained
+from bench.diagnosis.search.verdict_rules import (
+    INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO,
+    DiagnosisState,
+    decide_verdict,
+    is_unexplained,
+)
 from bench.diagnosis.validation.held_out_runs import Validation
 
 MIN_REMOVED_SHARE = 0.5
 """Minimum share of the discrepancy that reported effects remove if the cause is unknown."""
 COMPARED_MODEL_MARGIN = 15.0
 """Maximum distance in twice the log-likelihood of models that are evaluated on held-out runs."""
+MAX_REFIT_GAIN_RATIO = 2.0
+"""Maximum gain of a competitor by its final fit, as a multiple of the gain of the selected model.
+
+Competitors that this gain would not bring within the distance of indistinguishable models are not
+refitted.
+"""
+MAX_REFITTED_COMPETITORS = 4
+"""Maximum number of competing models that are fitted to final convergence."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +114,13 @@ class Confirmation(Inquiry):
             self._model = search.fit_competing_models(self._model)
             self._evaluate_on_held_out_runs()
         search_control.begin_question("structure")
-        self._model = search.fit_to_convergence(search.refit_first_states(self._model))
+        fitted = search.refit_first_states(self._model)
+        self._model = search.fit_to_convergence(fitted)
         lack_of_fit = assess_lack_of_fit(search, self._model)
+        if not lack_of_fit.has_structure:
+            self._refit_near_competitors(
+                self._model.penalised_log_likelihood - fitted.penalised_log_likelihood
+            )
         search_control.begin_question("alternatives")
         validation = self._held_out_validation
         model, causes = select_preferred_model(
@@ -129,6 +147,31 @@ class Confirmation(Inquiry):
             # Effects that leave most of the discrepancy only mimic what is missing.
             model, causes = base, ()
         return self._make_result(verdict, base, model, causes, lack_of_fit)
+
+    def _refit_near_competitors(self, gain: float) -> None:
+        """Fit the nearest competing models to final convergence, as the model was.
+
+        The final fit weights a residual by its own autocorrelation, which increases the likelihood
+        of every model. Without it, an effect with the same influence on the runs would be behind by
+        this increase, and count as excluded. Competitors differ from the model in one effect.
+
+        Args:
+            gain: what the final fit of the model gained, in twice the log-likelihood.
+        """
+        search, model = self._robot, self._model
+        if model is None or gain <= 0.0:
+            return
+        reach = INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO + MAX_REFIT_GAIN_RATIO * gain
+        competitors = [
+            other
+            for other in search.models.values()
+            if len(other.effects) == len(model.effects)
+            and len(set(other.effects) - set(model.effects)) == 1
+            and other.penalised_log_likelihood > model.penalised_log_likelihood - reach
+        ]
+        competitors.sort(key=lambda other: -other.penalised_log_likelihood)
+        for competitor in competitors[:MAX_REFITTED_COMPETITORS]:
+            search.fit_to_convergence(competitor)
 
     def _build_filter_result(self, identified: IdentifiedSet) -> DiagnosisResult:
         """Return the result for a set that filters identified in a model that stays incomplete.
