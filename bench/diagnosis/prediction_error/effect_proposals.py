@@ -26,6 +26,7 @@ from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.effects_at_joints import (
     JOINT_MODEL,
     SERVO_MODEL,
+    SET_POINT_MODEL,
     get_joint_name,
     get_servo_input,
     list_similar_shifts,
@@ -355,7 +356,7 @@ class EffectProposals:
         place = get_joint_name(evaluator, joint)
         servo = get_servo_input(evaluator, joint).removeprefix("u.")
         names = [f"{effect}@{place}" for effect in JOINT_MODEL]
-        names += [f"{effect}@{servo}" for effect in SERVO_MODEL]
+        names += [f"{effect}@{servo}" for effect in SERVO_MODEL + SET_POINT_MODEL]
         if not getattr(evaluator.simulator.system, "drives", {}).get(joint):
             names += COMMAND_MODEL
         return [name for name in names if name in evaluator.library]

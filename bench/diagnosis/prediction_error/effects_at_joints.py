@@ -18,6 +18,8 @@ JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")
 """Effects of the standard joint model, tried at the joint with the largest missing force."""
 SERVO_MODEL = ("actuator.stiffness", "actuator.damping")
 """Effects of the standard servo model, tried at the servo of the same joint."""
+SET_POINT_MODEL = ("servo.derivative",)
+"""Effects of the set point of the same servo: whether its D term acts on the error, as in a PID."""
 MANY_SHAPES = frozenset(
     {
         "force.periodic",

@@ -20,6 +20,7 @@ from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.effects_at_joints import (
     JOINT_MODEL,
     SERVO_MODEL,
+    SET_POINT_MODEL,
     acts_at_joint,
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
@@ -196,7 +197,7 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
-    starts = context.proposals.list_alone(len(JOINT_MODEL + SERVO_MODEL))
+    starts = context.proposals.list_alone(len(JOINT_MODEL + SERVO_MODEL + SET_POINT_MODEL))
     if not starts:
         return search.base_model
     fitted, best = list[FittedModel](), search.base_model
