@@ -106,7 +106,7 @@ class InputHold(Input):
         "interpolated"
     )
     source = "K. J. Astrom, B. Wittenmark, Computer-Controlled Systems (1997), chapter 7"
-    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, ((0, 1), (0, 1), (0, 1))),)
+    coefficients = (Coefficient("coefficient", _DIMENSIONLESS, ((0, 1), (0, 1), (0, 1)), most=1.5),)
     between = True  # (0), applied where means over steps are computed: `sims.engines.time_grid`
 
 

@@ -4,9 +4,9 @@ With u the set point, q the position, e = u - q, K the servo's stiffness and c t
 drive exerts in addition
 
 * (1) dead zone: K (dz(e) - e), dz(e) = e - clip(e, -c, c); the limits of the drive apply to it, too
-* (2) derivative: K (u(t) - u(t - c)): the servo's D term acts on the rate of the error, instead of
-  the rate of q alone; c is the D gain divided by the P gain, and the rate is averaged over the
-  time c, so that a step of the set point gives a pulse of its height instead of an impulse
+* (2) derivative: K c (u(t) - u(t - T)) / T: the servo's D term acts on the rate of the error,
+  instead of the rate of q alone; c is the D gain divided by the P gain, and the rate is averaged
+  over T, a period of the controller, so that a step of the set point gives a pulse, not an impulse
 * (3) profile: the servo follows p instead of u, where p moves to u as fast as |d2p/dt2| <= c
   permits and arrives at rest: d2p/dt2 = c sign(u - p - |dp/dt| dp/dt / (2 c)), and zero after
   arrival
@@ -51,6 +51,8 @@ _HALF_WIDTH_RANGES = ((0, 1), (0, 0.05), (0, 0.2))
 """Plausible half widths of a dead zone, in the units of `_SET_POINT_UNITS`."""
 _SECONDS = ("s", "s", "s")
 """Seconds, on every kind of system."""
+_CONTROL_PERIOD = 0.002
+"""Time T in s over which a servo computes the rate of its set point; controllers run at 500 Hz."""
 _ACCELERATION_UNITS = ("m/s^4", "m/s^2", "rad/s^2")
 """Units of `_SET_POINT_UNITS`, per second squared."""
 _ACCELERATION_LIMIT_RANGES = ((0, 500), (0, 50), (0, 200))
@@ -95,21 +97,21 @@ class ServoDerivativeAction(Input):
     coefficients = (Coefficient("coefficient", _SECONDS, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """Return the set point (L, S) plus its change in the last c seconds.
+        """Return the set point (L, S) plus c times its rate.
 
         Shapes: L batch elements, S steps.
 
-        The set point u(t) becomes u(t) + u(t) - u(t - c), so that a servo of stiffness K exerts K
-        (u(t) - u(t - c)) in addition (2). Values are means over each step.
+        The set point u(t) becomes u(t) + c (u(t) - u(t - T)) / T with the control period T, so that
+        a servo of stiffness K exerts K c (u(t) - u(t - T)) / T in addition (2). Values are means
+        over each step.
 
         Args:
             c: (1, L, 1) ratio c of D gain to P gain, s.
             signal: signal (L, S) over the steps.
         """
         lead = np.maximum(c[0], 0.0)
-        return np.where(
-            lead > 0, 2.0 * signal.values - _average_earlier_signal(signal, lead), signal.values
-        )  # (2)
+        earlier = _average_earlier_signal(signal, np.where(lead > 0, _CONTROL_PERIOD, 0.0))
+        return signal.values + lead / _CONTROL_PERIOD * (signal.values - earlier)  # (2)
 
 
 class ServoMotionProfile(Input):

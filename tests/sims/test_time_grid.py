@@ -213,7 +213,6 @@ REMEMBERING = {
     "input.lag": 0.2,
     "input.rate": 8.0,
     "input.delay": 0.13,
-    "servo.derivative": 0.15,
     "servo.profile": 60.0,
     "backlash": 0.5,
 }

@@ -180,7 +180,8 @@ class ModelFilters:
         about whose smoothed motion the model is linearised. The first filter with these effects is
         linearised once more, about its own motion with the same Jacobians. The share `numerics` of
         the integrator's step errors is subtracted from the defects of the steps (by how much a step
-        of the model misses the next state), so that they are not taken for a missing force.
+        of the model misses the next state), so that they are not taken for a missing force. This is
+        done only if the runs are then likelier: a selection of wrong effects has a wrong share.
         """
         if not model.effects:
             return self.base
@@ -194,7 +195,9 @@ class ModelFilters:
             self._of_sets[names] = followed
             if self.numerics:
                 defects = followed.runs.defects - self.numerics * followed.step_errors
-                followed = followed.refit_noise(replace(followed.runs, defects=defects))
+                corrected = followed.refit_noise(replace(followed.runs, defects=defects))
+                if corrected.log_likelihood > followed.log_likelihood:
+                    followed = corrected
             self._of_models[key] = followed
         return self._of_models[key]
 

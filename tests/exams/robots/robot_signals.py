@@ -61,6 +61,8 @@ SIGNALS = {"multisine": _multisine, "ramps": _ramps, "steps": _steps, "chirp": _
 
 COUPLING = "joint.coupling@"
 INPUTS = ("input.", "servo.derivative", "servo.profile")
+CONTROL_PERIOD = 0.002
+"""Period of a servo's controller, s."""
 
 
 class AppliedSignal:
@@ -80,11 +82,11 @@ class AppliedSignal:
         if "servo.profile" in effects:
             values, begins = profiled(values, begins, effects["servo.profile"][0])
         if "servo.derivative" in effects:
-            # The D term takes a rate over `span` seconds, so a jump acts for that time.
-            (span,) = effects["servo.derivative"]
-            both = np.unique(np.concatenate([begins, begins + span]))
-            now, before = (_held(begins, values, both - late) for late in (0.0, span))
-            values, begins = 2 * now - before, both
+            # The D term takes the rate over a period of the controller, so a jump acts that long.
+            (lead,) = effects["servo.derivative"]
+            both = np.unique(np.concatenate([begins, begins + CONTROL_PERIOD]))
+            now, before = (_held(begins, values, both - late) for late in (0.0, CONTROL_PERIOD))
+            values, begins = now + lead / CONTROL_PERIOD * (now - before), both
         self.values, self.begins = values, begins
 
     def at(self, t):

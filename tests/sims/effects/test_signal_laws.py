@@ -35,15 +35,21 @@ RAMP = np.array([-2.0, -1.0, 0.0, 0.5, 1.0, 2.0])
         ("input.rate", -0.1, RAMP),
         ("servo.derivative", -0.1, RAMP),
         ("servo.profile", -0.1, RAMP),
-        # a jump counts twice for the time c, over which the rate is computed
+        # The pulse of a jump has the area c times its height, here within one step.
         ("servo.derivative", 0.1, [-4.0, 0.0, 1.0, 1.0, 1.5, 3.0]),
-        ("servo.derivative", 0.2, [-4.0, -2.0, 2.0, 2.0, 2.0, 3.5]),
+        ("servo.derivative", 0.2, [-6.0, 1.0, 2.0, 1.5, 2.0, 4.0]),
         ("servo.derivative", 0.05, [-3.0, -0.5, 0.5, 0.75, 1.25, 2.5]),
         ("sensor.lag", -0.1, RAMP),
     ],
 )
 def test_values_by_hand(name, c, expected):
     assert through(name, c, RAMP) == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_rate_of_a_jump_lasts_one_period_of_the_controller():
+    jump = [0.0, 0.0, 1.0, 1.0, 1.0, 1.0]
+    expected = [0.0, 0.0, 26.0, 26.0, 1.0, 1.0]  # 1 + 0.05 s times 1 / 0.002 s
+    assert through("servo.derivative", 0.05, jump, 0.001) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("step", [0.001, 0.1, 3.0])

@@ -52,6 +52,50 @@ def test_a_ripple_is_found_with_few_simulations(tmp_path):
     assert answer.simulations < 400
 
 
+LEAD = 0.05
+"""Kd / kp of a servo whose D term acts on the error, s."""
+
+
+def test_a_d_term_on_the_error_is_not_a_command_ahead_of_its_time(tmp_path):
+    """A controller of 500 Hz computes the rate of the set point from its last two values."""
+    model = mujoco.MjModel.from_xml_string(ARM)
+    step, gain = model.opt.timestep, model.actuator_gainprm[0, 0]
+    rng, times, runs = np.random.default_rng(3), 0.01 * np.arange(300), []
+    for _ in range(3):
+        phases = rng.uniform(0.0, 6.0, 2)
+        commands = 0.9 * np.sin(2.0 * times + phases[0]) + 0.4 * np.sin(5.1 * times + phases[1])
+
+        def push(data, commands=commands):
+            now, before = (
+                commands[int(max(data.time - late, 0.0) / 0.01 + 1e-6)] for late in (0.0, step)
+            )
+            data.qfrc_applied[0] = gain * LEAD * (now - before) / step
+
+        readings = follow(model, commands, 5, start=commands[0], act=push)
+        runs.append((times, commands, readings + rng.normal(0.0, 1e-3, readings.shape)))
+    description = describe({"u.servo": "rad", "q.hinge": "rad"}, 0.001)
+    answer = explain(write_log(tmp_path, description, "u.servo,q.hinge", runs, arm=ARM)).answer
+    assert answer.verdict == "named"
+    (cause,) = answer.causes
+    assert (cause.effect, cause.alternatives) == ("servo.derivative@servo", ())
+    assert cause.coefficients["coefficient"].value == pytest.approx(LEAD, rel=0.01)
+
+
+def test_damping_of_a_joint_and_of_its_servo_are_told_together(tmp_path):
+    """The first selection is wrong, and with it its share of the integrator's errors."""
+    model = mujoco.MjModel.from_xml_string(ARM.replace('damping="0.1"', 'damping="0.35"'))
+    rng, times, runs = np.random.default_rng(0), 0.01 * np.arange(300), []
+    for _ in range(3):
+        phases = rng.uniform(0.0, 6.0, 2)
+        commands = 0.9 * np.sin(2.0 * times + phases[0]) + 0.4 * np.sin(5.1 * times + phases[1])
+        readings = follow(model, commands, 5, start=commands[0])
+        runs.append((times, commands, readings + rng.normal(0.0, 1e-3, readings.shape)))
+    description = describe({"u.servo": "rad", "q.hinge": "rad"}, 0.001)
+    answer = explain(write_log(tmp_path, description, "u.servo,q.hinge", runs, arm=ARM)).answer
+    (cause,) = answer.causes
+    assert {cause.effect, *cause.alternatives} == {"drag.linear@hinge", "actuator.damping@servo"}
+
+
 class _OtherFormIsLikelierError(Exception):
     pass
 
