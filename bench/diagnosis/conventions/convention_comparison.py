@@ -21,7 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -54,7 +54,6 @@ from bench.diagnosis.prediction_error.regression_columns import group_coefficien
 from bench.diagnosis.prediction_error.regression_selection import identify
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
-from bench.diagnosis.search.score_test import DirectionGroup
 from sims.core.plain_values import join_first_names
 from sims.recording.recording import Recording, Run
 from sims.robot.robot_model import RobotModel
@@ -84,6 +83,8 @@ SUSPECT_SHARE = 0.1
 """Minimum missing force of a joint whose conventions are tested, as a share of its typical force,
 and of the largest such share if that exceeds 1.
 """
+SIMILAR_CAUSE_STEPS = 6
+"""Maximum number of Gauss-Newton steps of an effect that looks like a convention."""
 OFF_FACTOR = 1e-6
 """Factor that switches an input off."""
 MAX_REMAINING_FORCE = 0.3
@@ -243,7 +244,7 @@ class ConventionComparison:
         with_conventions = _get_log_likelihood(
             self._filter_runs(segments)
         ) + _compute_log_scale_correction(hypotheses, segments)
-        with_causes = self._compute_log_likelihood_of_causes(corrected)
+        with_causes = self._compute_log_likelihood_of_causes(corrected, hypotheses)
         if with_conventions < with_causes + CAUSES_MARGIN:
             return False
         # 3. Minus infinity: the filter diverged, so causes could not be compared.
@@ -518,7 +519,9 @@ class ConventionComparison:
         evaluator.close()
         return followed
 
-    def _compute_log_likelihood_of_causes(self, corrected: Recording) -> float:
+    def _compute_log_likelihood_of_causes(
+        self, corrected: Recording, hypotheses: Sequence[ConventionHypothesis]
+    ) -> float:
         """Return the log-likelihood of the log as described, with the best set of causes.
 
         Conventions must exceed it to be confirmed. Each effect is penalised by half the logarithm
@@ -529,12 +532,14 @@ class ConventionComparison:
         2. Select effects by regression of the filter's prediction errors.
         3. Add the selected effects to the model one by one, and filter again: with large missing
            forces, the regression is inaccurate.
-        4. Also try soft friction, which has no linear response.
-        5. If the corrected log is not explained either, the larger of regression and filters is
+        4. Add single effects that look like one of the hypotheses: the regression may miss them.
+        5. Also try soft friction, which has no linear response.
+        6. If the corrected log is not explained either, the larger of regression and filters is
            used.
 
         Args:
             corrected: Recording with its conventions corrected.
+            hypotheses: Differences of the conventions that were corrected.
         """
         subject = self.subject
         segments = self._select_segments(subject.recording)
@@ -574,12 +579,21 @@ class ConventionComparison:
                 theta[evaluator.coefficient_slices[effect_group.effect]] = group_coefficients(
                     evaluator, probes, effect_group, coefficients
                 )
-            fitted = _fit_coefficients(filtered.with_parameters(theta), groups)
+            fitted = _fit_coefficients(
+                filtered.with_parameters(theta), [group.effect for group in groups]
+            )
             best = max(best, fitted.log_likelihood - penalty)
-        # 4. Soft friction.
+        # 4. Effects that look like a convention.
+        for name, start in _list_similar_causes(evaluator, hypotheses).items():
+            theta = evaluator.get_nominal_theta()
+            theta[evaluator.get_coefficient_indices(name)] = start
+            fitted = _fit_coefficients(filtered.with_parameters(theta), [name], SIMILAR_CAUSE_STEPS)
+            # No penalty: the search distinguishes them better, if the data do.
+            best = max(best, fitted.log_likelihood)
+        # 5. Soft friction.
         best = max(best, _compute_log_likelihood_of_soft_friction(filtered))
         evaluator.close()
-        # 5. Regression, if its result is the larger one.
+        # 6. Regression, if its result is the larger one.
         if self._compute_largest_missing_force(corrected) < LARGE_MISSING_FORCE:
             return best
         return max(best, selected.log_likelihood - penalty)
@@ -668,18 +682,59 @@ def _estimate_white_noise(evaluator: RunEvaluator, recording: Recording) -> Nois
     return NoiseModel.make_white(compute_noise_floor(evaluator, recording).sigma)
 
 
-def _fit_coefficients(followed: FollowedRuns, groups: Sequence[DirectionGroup]) -> FollowedRuns:
+def _list_similar_causes(
+    evaluator: RunEvaluator, hypotheses: Sequence[ConventionHypothesis]
+) -> dict[str, float]:
+    """Return effects that change a log nearly as a hypothesis does, with a first coefficient.
+
+    - A command that seems late, because the robot answers before it: a servo whose D term acts on
+      the rate of the set point, which leads by this time.
+    - A zero that seems shifted: an offset of the encoder, of the command or of the force, or a
+      centre of mass at another place. Only for the first one is a coefficient known: by how much
+      readings differ from commands.
+
+    Args:
+        evaluator: the runs as described.
+        hypotheses: differences of the conventions.
+    """
+    causes: dict[str, float] = {}
+    run, kind = evaluator.runs[0], cast(Any, evaluator.kind)
+    model = kind.robot.compiled
+    for hypothesis in hypotheses:
+        if hypothesis.late > 0.0:
+            lead = "servo.derivative"
+            family = [f"{lead}@*"] if f"{lead}@*" in evaluator.library else []
+            single = [name for name in evaluator.library if name.partition("@")[0] == lead]
+            causes |= dict.fromkeys(family or single, hypothesis.late)
+        if not hypothesis.has_free_offset:
+            continue
+        commands = [name for name in hypothesis.changes if name in run.inputs]
+        for channel in (name for name in hypothesis.changes if name not in run.inputs):
+            joint = channel.removeprefix("q.")
+            body = model.body(int(model.jnt_bodyid[kind.robot.joint(joint).id])).name
+            offset = 0.0
+            for command in commands:
+                offset = float(np.nanmean(run.channels[channel] - run.inputs[command]))
+                causes[f"input.bias@{command.removeprefix('u.')}"] = 0.0
+            causes |= {f"sensor.bias@{channel}": offset, f"force.bias@{joint}": 0.0}
+            causes[f"mass.offset@{body}"] = 0.0
+    return {name: start for name, start in causes.items() if name in evaluator.library}
+
+
+def _fit_coefficients(
+    followed: FollowedRuns, names: Sequence[str], steps: int = GAUSS_NEWTON_STEPS
+) -> FollowedRuns:
     """Fit the coefficients of effects by maximum likelihood of a Kalman filter (Gauss-Newton).
 
     Args:
         followed: the runs, followed by the filter with the present coefficients.
-        groups: the effects, one group of directions each.
+        names: names of the effects.
+        steps: maximum number of steps.
     """
-    evaluator = followed.evaluator
     return maximise_innovation_likelihood(
         followed,
-        get_bounds_by_index(evaluator, [group.effect for group in groups]),
-        GAUSS_NEWTON_STEPS,
+        get_bounds_by_index(followed.evaluator, names),
+        steps,
         lambda theta, best: best.with_parameters(theta),
     )
 

@@ -81,7 +81,7 @@ def test_a_d_term_on_the_error_is_not_a_command_ahead_of_its_time(tmp_path):
     assert cause.coefficients["coefficient"].value == pytest.approx(LEAD, rel=0.01)
 
 
-def test_damping_of_a_joint_and_of_its_servo_are_told_together(tmp_path):
+def test_damping_of_a_joint_and_of_its_servo_are_one_set(tmp_path):
     """The first selection is wrong, and with it its share of the integrator's errors."""
     model = mujoco.MjModel.from_xml_string(ARM.replace('damping="0.1"', 'damping="0.35"'))
     rng, times, runs = np.random.default_rng(0), 0.01 * np.arange(300), []
