@@ -119,8 +119,8 @@ def _diagnose(
 
     The motion of a robot that balances or flies is unstable without its controller. A simulation
     with the recorded commands and a wrong model leaves it within a second, but not within a short
-    segment whose initial state is estimated. Neither does a chaotic motion. The simulators are open
-    within the `with` block.
+    segment whose initial state is estimated. The same holds for a chaotic motion. The simulators
+    are open within the `with` block.
 
     Args:
         recording: See `explain`.
@@ -130,7 +130,10 @@ def _diagnose(
         DivergingSimulationError: The simulation fails in the shortest segments, too.
     """
     sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
-    started, attempt, remaining_durations = time.perf_counter(), options, list(SEGMENT_DURATIONS)
+    started = time.perf_counter()
+    attempt = options
+    # Durations of segments in s, the longest first.
+    remaining_durations = list(SEGMENT_DURATIONS)
     while True:
         with (
             closing(ForkedWorkerPool(options.jobs or 1)) as worker_pool,
@@ -146,13 +149,19 @@ def _diagnose(
                 if not may_divide:
                     raise
                 # Durations that the error says to be too long are not tried.
-                remaining_durations = [s for s in remaining_durations if s <= error.longest_segment]
+                remaining_durations = [
+                    duration
+                    for duration in remaining_durations
+                    if duration <= error.longest_segment
+                ]
             else:
                 yield diagnosis
                 return
-        seconds, elapsed = remaining_durations.pop(0), time.perf_counter() - started
-        budget = None if options.budget is None else max(options.budget - elapsed, 0.0)
-        attempt = replace(options, pieces=seconds, budget=budget)
+        seconds = remaining_durations.pop(0)
+        attempt = replace(options, pieces=seconds)
+        if options.budget is not None:
+            elapsed = time.perf_counter() - started
+            attempt = replace(attempt, budget=max(options.budget - elapsed, 0.0))
         options.say(
             f"no simulation follows the runs: they are cut into pieces of {seconds:g} s, "
             "each with its own initial state (--pieces)"
@@ -174,9 +183,11 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
         may_divide: whether the runs are cut into shorter segments if no simulation follows them.
 
     Raises:
+        DivergingSimulationError: The runs have to be cut into shorter segments.
         InputError: The conventions of the recording contradict the model file, or no fit of the
             base model can simulate the recording.
     """
+    # These remember what they find: wrong units, and numerical settings that differ from the file.
     error_check = RecordingErrorCheck()
     step_choice, option_choice = TimeStepChoice(), SolverOptionChoice()
     # 1. Conventions.

@@ -77,13 +77,15 @@ def select_written_causes(
 ) -> tuple[dict[str, Mapping[str, FittedValue]], tuple[str, ...]]:
     """Select the causes that a model file may contain.
 
-    Numbers at a bound of their range, or without an interval, are not results and are left out. So
-    are effects at the coordinates of a floating body, which the file does not have. Options of the
-    integrator are always written.
+    - Options of the integrator are always written.
+    - Effects at the coordinates of a floating body are left out, as the file does not have them.
+    - Numbers at a bound of their range, or without an interval, are not results and are left out,
+      with all coefficients of their effect at that place.
 
     Args:
-        causes: Coefficients by effect.
-        base_joints: Names of these coordinates.
+        causes: Coefficients by effect. A coefficient of an effect at several places (a family) is
+            named ``COEFFICIENT@PLACE``.
+        base_joints: Names of the coordinates of floating bodies.
 
     Returns:
         The selected causes, and a line for each number that is left out.
@@ -96,13 +98,17 @@ def select_written_causes(
             continue
         # Each place of a family is handled alone; coefficients of one place belong together.
         unidentified = {
-            key.partition("@")[2]: n for key, n in coefficients.items() if not n.is_result
+            _get_place(key): fitted_value
+            for key, fitted_value in coefficients.items()
+            if not fitted_value.is_result
         }
-        selected_numbers = {
-            key: n for key, n in coefficients.items() if key.partition("@")[2] not in unidentified
+        selected_values = {
+            key: fitted_value
+            for key, fitted_value in coefficients.items()
+            if _get_place(key) not in unidentified
         }
-        if selected_numbers:
-            selected_causes[effect] = selected_numbers
+        if selected_values:
+            selected_causes[effect] = selected_values
         for place, fitted_value in unidentified.items():
             # A number that was never fitted has the value of the model file.
             if fitted_value.at_bound is None and not fitted_value.value:
@@ -118,6 +124,11 @@ def select_written_causes(
     return selected_causes, tuple(left_out)
 
 
+def _get_place(name: str) -> str:
+    """Return the place of an effect or a coefficient, such as a joint; empty if it names none."""
+    return name.partition("@")[2]
+
+
 def _leave_out_base_effects(
     causes: Mapping[str, Mapping[str, FittedValue]], base_joints: Collection[str]
 ) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
@@ -128,22 +139,28 @@ def _leave_out_base_effects(
     Args:
         causes: fitted coefficients by effect.
         base_joints: names of the coordinates of floating bodies.
+
+    Returns:
+        The remaining coefficients by effect, and the lines.
     """
     remaining: dict[str, Mapping[str, FittedValue]] = {}
     left_out = []
-    for name, numbers in causes.items():
-        effect, _, place = name.partition("@")
-        at_base = {
-            key: n for key, n in numbers.items() if (key.partition("@")[2] or place) in base_joints
-        }
-        for key, number in at_base.items():
-            value_text = append_unit(f"{number.value:.4g}", number.unit)
+    for name, coefficients in causes.items():
+        effect, _, effect_place = name.partition("@")
+        remaining_values = {}
+        for key, fitted_value in coefficients.items():
+            # The coefficient of a family has its own place.
+            place = _get_place(key) or effect_place
+            if place not in base_joints:
+                remaining_values[key] = fitted_value
+                continue
+            value_text = append_unit(f"{fitted_value.value:.4g}", fitted_value.unit)
             left_out.append(
-                f"{effect}@{key.partition('@')[2] or place}: {value_text}, not in the file: MuJoCo "
-                "has no such element at a free joint"
+                f"{effect}@{place}: {value_text}, not in the file: MuJoCo has no such element at a "
+                "free joint"
             )
-        if len(at_base) < len(numbers):
-            remaining[name] = {key: n for key, n in numbers.items() if key not in at_base}
+        if remaining_values:
+            remaining[name] = remaining_values
     return remaining, left_out
 
 
@@ -156,16 +173,22 @@ def _collect_written_files(written_files: WrittenModelFiles) -> dict[str, str]:
 def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, FittedValue]]:
     """Collect the fitted changes of a robot as coefficients by effect.
 
-    They are freed numbers of its model file, diagnosed effects, and the step and integrator if they
-    differ from those of the file.
+    They are numbers of its model file that the user freed for the fit, diagnosed effects, and the
+    time step and other options of the integrator if they differ from those of the file.
     """
     kind: Any = extended.kind
     causes: dict[str, Mapping[str, FittedValue]] = {}
     for effect in kind.system.freed_effects:
-        names = {c.name: f"{effect.name}.{c.name}" for c in effect.coefficients}
-        if len(names) == 1:
-            names = dict.fromkeys(names, effect.name)
-        causes[effect.name] = {c: extended.parameters[name] for c, name in names.items()}
+        names = [coefficient.name for coefficient in effect.coefficients]
+        # A freed number is a parameter with the name of its effect, and of its coefficient if there
+        # are several.
+        parameters = (
+            [effect.name] if len(names) == 1 else [f"{effect.name}.{name}" for name in names]
+        )
+        causes[effect.name] = {
+            name: extended.parameters[parameter]
+            for name, parameter in zip(names, parameters, strict=True)
+        }
     return {**causes, **extended.effects, **_list_numerics_causes(kind)}
 
 
@@ -246,16 +269,14 @@ def _compare_blocks(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFil
         new: lines of the block in the extended file, with comments before elements.
     """
     elements = list(_pair_with_comments(new))
+    lines_before = list(old)
     if len(old) != len(elements):
-        for i, (line, comment) in enumerate(elements):
-            yield ModelFileChange(
-                _format_element(line), "\n".join(old) if i == 0 else "", line, comment
-            )
-        if not elements and old:
-            yield ModelFileChange(_format_element(old[0]), "\n".join(old), "")
-        return
-    for line_before, (line, comment) in zip(old, elements, strict=True):
-        yield ModelFileChange(_format_element(line), line_before, line, comment)
+        lines_before = ["\n".join(old), *[""] * (len(elements) - 1)]
+    if elements:
+        for line_before, (line, comment) in zip(lines_before, elements, strict=True):
+            yield ModelFileChange(_format_element(line), line_before, line, comment)
+    elif old:
+        yield ModelFileChange(_format_element(old[0]), "\n".join(old), "")
 
 
 def _list_commented_elements(lines: Sequence[str]) -> Iterator[ModelFileChange]:
@@ -269,12 +290,13 @@ def _pair_with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield each XML element (a line) with the comments before it that explain a fitted value."""
     comments: list[str] = []
     for line in lines:
-        if match := _COMMENT.fullmatch(line):
-            # A comment on the whole file does not describe the next element.
-            comments += [match[1]] if FITTED_COMMENT_MARKER in match[1] else []
-            continue
-        yield line, "; ".join(comments)
-        comments = []
+        match = _COMMENT.fullmatch(line)
+        if match is None:
+            yield line, "; ".join(comments)
+            comments = []
+        # Other comments, such as one on the whole file, do not describe the next element.
+        elif FITTED_COMMENT_MARKER in match[1]:
+            comments.append(match[1])
 
 
 def _format_element(line: str) -> str:

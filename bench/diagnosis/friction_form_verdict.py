@@ -41,12 +41,15 @@ def has_dry_friction(evaluator: RunEvaluator, names: Iterable[str]) -> bool:
         evaluator: Run evaluator; its simulator may be a robot.
         names: Names of effects.
     """
-    robot: Any = evaluator.kind
-    if not robot.has_model:
+    kind: Any = evaluator.kind
+    if not kind.has_model:
         return False
-    freed_effects: list[type[Effect]] = list(robot.system.freed_effects)
-    plain_names = [get_stateless_friction(evaluator, name) for name in names]
-    effects = [*(type(evaluator.available_effects[name]) for name in plain_names), *freed_effects]
+    # A law with an internal state counts if it contains dry friction.
+    stateless_names = [get_stateless_friction(evaluator, name) for name in names]
+    effects: list[type[Effect]] = [
+        *(type(evaluator.available_effects[name]) for name in stateless_names),
+        *kind.system.freed_effects,
+    ]
     return any(is_dry_friction(effect) for effect in effects)
 
 
@@ -79,14 +82,15 @@ def add_solver_parameters(evaluator: RunEvaluator, name: str, description: str) 
         name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
         description: Description of the effect.
     """
-    robot: Any = evaluator.kind
-    effect = type(evaluator.available_effects[name])
-    members = members_of(effect)
-    joints = [joint for joint in robot.robot.joints if joint.has_one_coordinate]
-    coordinate_indices = [member.coordinate for member in members if member.coordinate is not None]
-    dofs = [joints[place].velocity for place in coordinate_indices]
-    parameters = {tuple(robot.robot.compiled.dof_solref[dof].tolist()) for dof in dofs}
-    text = " or ".join(" ".join(f"{value:g}" for value in pair) for pair in sorted(parameters))
+    kind: Any = evaluator.kind
+    robot = kind.robot
+    joints = [joint for joint in robot.joints if joint.has_one_coordinate]
+    # An effect at several joints has a member for each, with the index of the joint's coordinate.
+    members = members_of(type(evaluator.available_effects[name]))
+    dofs = [joints[m.coordinate].velocity for m in members if m.coordinate is not None]
+    # Pairs of time constant and damping ratio, which joints may share.
+    parameters = sorted({tuple(robot.compiled.dof_solref[dof].tolist()) for dof in dofs})
+    text = " or ".join(" ".join(f"{value:g}" for value in pair) for pair in parameters)
     sentence, bracket, place = description.partition(" (at ")
     sentence = sentence.removesuffix(_STICTION_TEXT)
     return f"{sentence}, in MuJoCo's soft form (solreffriction {text}){bracket}{place}"
@@ -97,7 +101,8 @@ def refit_if_likelier_soft(
 ) -> FittedModel | None:
     """Refit a robot model in MuJoCo's soft form of dry friction, and return it if it is likelier.
 
-    The dry friction may be an effect or a free number.
+    The dry friction may be an effect or a free number. A model without dry friction, or with soft
+    friction already, is not refitted.
 
     Args:
         models: Models with stiff friction, with their noise and frozen parameters.
@@ -189,18 +194,20 @@ def get_stateless_friction(evaluator: RunEvaluator, name: str) -> str:
     effect = evaluator.available_effects[name]
     if effect.hook != "hidden":
         return name
-    contained = [n for n in effect.contains if n in evaluator.available_effects]
-    friction = [n for n in contained if is_dry_friction(evaluator.available_effects[n])]
-    return friction[0] if friction else name
+    for contained_name in effect.contains:
+        contained_effect = evaluator.available_effects.get(contained_name)
+        if contained_effect is not None and is_dry_friction(contained_effect):
+            return contained_name
+    return name
 
 
 def replace_by_stateless_friction(
     evaluator: RunEvaluator, names: Iterable[str], theta: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Replace effects with a state by the dry friction that they contain.
+    """Replace effects with a state by the dry friction that they contain, with the same limit.
 
     Some friction laws have an internal state, such as the bend of bristles. Only laws without one
-    exist in both forms, stiff and soft.
+    exist in both forms, stiff and soft. Where a model has both, their limits are added.
 
     Shapes: P parameters.
 
@@ -212,14 +219,15 @@ def replace_by_stateless_friction(
     Returns:
         Names of the effects and parameters of the model without these states.
     """
-    theta, stateless_names = theta.copy(), dict[str, None]()
+    theta = theta.copy()
+    stateless_names = []
     for name in names:
         stateless_name = get_stateless_friction(evaluator, name)
-        stateless_names[stateless_name] = None
+        stateless_names.append(stateless_name)
         if stateless_name != name:
             # The first coefficient of both effects is the limit of the friction force.
-            theta[evaluator.get_coefficient_indices(stateless_name)[0]] += theta[
-                evaluator.get_coefficient_indices(name)[0]
-            ]
-            theta[evaluator.get_coefficient_indices(name)] = 0.0
-    return tuple(stateless_names), theta
+            limit, *_ = coefficient_indices = evaluator.get_coefficient_indices(name)
+            stateless_limit, *_ = evaluator.get_coefficient_indices(stateless_name)
+            theta[stateless_limit] += theta[limit]
+            theta[coefficient_indices] = 0.0
+    return tuple(dict.fromkeys(stateless_names)), theta

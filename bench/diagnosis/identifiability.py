@@ -139,7 +139,8 @@ class _IdentifiabilityAssessment:
 
         `states` (R, n, s) has the scaled derivatives by the initial states, where n = T · C is
         the number of samples times channels of a run. `parameters` (R · n, q) has those by the q
-        free parameters, without the part that a change of the initial states can reproduce.
+        free parameters, without the part that a change of the initial states can reproduce. In
+        `fit.jacobian` (R, T, C, q + s) the parameters come first.
 
         Shapes: R runs, s states of a run.
 
@@ -149,10 +150,11 @@ class _IdentifiabilityAssessment:
             fit: Fitted model, with the derivatives of the runs.
             direction_set: Directions of all candidate effects.
         """
-        self.evaluator, self.noise, self.fit, self.found = evaluator, noise, fit, direction_set
-        self.seen = np.isfinite(evaluator.observed)
+        self.evaluator, self.noise = evaluator, noise
+        self.fit, self.direction_set = fit, direction_set
+        self.observed_mask = np.isfinite(evaluator.observed)
         q = fit.free_indices.size
-        jacobian = np.where(self.seen[..., None], fit.jacobian, 0.0)
+        jacobian = np.where(self.observed_mask[..., None], fit.jacobian, 0.0)
         jacobian /= noise.sigma[:, None]
         runs = len(jacobian)
         flat = jacobian.reshape(runs, -1, jacobian.shape[3])
@@ -167,10 +169,13 @@ class _IdentifiabilityAssessment:
         return (*free, *causes)
 
     def _project_out_states(self, columns: Array) -> Array:
-        """Project the initial states of each run out of columns (R, n, k); return (N, k).
+        """Project the initial states of each run out of k columns (R, n, k); return (R n, k).
 
-        What a change of the initial states could explain gives no information on a parameter. There
-        are N = R n samples in R runs; the prior of the initial states limits their change.
+        What a change of the initial states could explain gives no information on a parameter. The
+        prior of the initial states limits their change: it is added to the normal equations of the
+        least-squares fit of each column by the derivatives `states` (R, n, s).
+
+        Shapes: R runs, n samples times channels of a run, s states of a run.
         """
         state_jacobian = self.states
         precision = np.diag(compute_state_prior(self.evaluator) ** -2.0)
@@ -183,13 +188,18 @@ class _IdentifiabilityAssessment:
         return projected.reshape(runs * samples, count)
 
     def _project_out_parameters(self, candidates: Sequence[int], basis: Array) -> Array:
-        """Return responses (N, k), in units of the noise, without initial states and parameters.
+        """Return the part of k responses, in units of the noise, that nothing else can reproduce.
+
+        The parts that a change of the initial states or of the free parameters can reproduce are
+        projected out. The result is (N, k), for N samples times channels of all runs.
 
         Args:
             candidates: indices of k candidates.
             basis: (N, q) orthonormal basis of the derivatives by the free parameters.
         """
-        responses = np.where(self.seen[..., None], self.found.responses[..., candidates], 0.0)
+        responses = np.where(
+            self.observed_mask[..., None], self.direction_set.responses[..., candidates], 0.0
+        )
         responses = responses / self.noise.sigma[:, None]
         columns = self._project_out_states(responses.reshape(len(responses), -1, len(candidates)))
         projected: Array = columns - basis @ (basis.T @ columns)
@@ -212,7 +222,9 @@ class _IdentifiabilityAssessment:
         for index, error, row in zip(free_indices, errors.tolist(), correlations, strict=True):
             parameter = self.evaluator.parameters[index]
             confounders = [
-                pair for pair in zip(names, row.tolist(), strict=True) if pair[0] != parameter.name
+                (name, correlation)
+                for name, correlation in zip(names, row.tolist(), strict=True)
+                if name != parameter.name
             ]
             assessments.append(
                 _classify_parameter(parameter.name, True, parameter, Z95 * error, confounders)
@@ -226,14 +238,18 @@ class _IdentifiabilityAssessment:
     def _assess_causes(self) -> list[ParameterIdentifiability]:
         """Assess the coefficient of each possible cause, fitted with the free parameters.
 
-        1. Project initial states and parameters out of the direction of each coefficient. The norm
-           of the rest, in units of the noise, is the information on the coefficient.
-        2. Select the shape with the largest norm for each coefficient.
+        A direction is the change of all samples by a coefficient. A coefficient may have several:
+        one for each shape, a choice of the other coefficients such as a frequency. A limit or
+        backlash (a switching effect) has one for each tried size.
+
+        1. Project initial states and parameters out of each direction. The norm of the rest, in
+           units of the noise, is the information on the coefficient.
+        2. Select the direction with the largest norm for each coefficient.
         3. Compute its interval, and its correlations with the coefficients of other effects.
 
         Effects that act at all places are represented by their members at single places.
         """
-        evaluator, candidates = self.evaluator, self.found.candidates
+        evaluator, candidates = self.evaluator, self.direction_set.candidates
         indices = [
             k
             for k, probe in enumerate(candidates)
@@ -247,7 +263,7 @@ class _IdentifiabilityAssessment:
             # 1. Information on each direction.
             columns = self._project_out_parameters(block, basis)
             norms = np.sqrt(np.einsum("nk,nk->k", columns, columns))
-            # 2. A coefficient with several shapes is represented by the most sensitive one.
+            # 2. The most sensitive direction.
             for column, norm, k in zip(columns.T, norms.tolist(), block, strict=True):
                 probe = candidates[k]
                 if probe.effect in switching_effects and not probe.is_single_size:
@@ -263,9 +279,8 @@ class _IdentifiabilityAssessment:
         for row, ((name, coefficient_index), direction) in zip(
             correlations, most_sensitive.items(), strict=True
         ):
-            parameter = evaluator.parameters[
-                evaluator.get_coefficient_indices(name)[coefficient_index]
-            ]
+            parameter_index = evaluator.get_coefficient_indices(name)[coefficient_index]
+            parameter = evaluator.parameters[parameter_index]
             probe, norm = direction.probe, direction.norm
             half_width = Z95 / norm if norm > 0 else np.inf
             confounders = [
@@ -275,8 +290,9 @@ class _IdentifiabilityAssessment:
                 )
                 if other_effect != name and other.norm > 0
             ]
-            is_single_coefficient = sum(1 for effect, _ in most_sensitive if effect == name) == 1
-            label = name if is_single_coefficient else f"{name} {parameter.name.rpartition('.')[2]}"
+            label = name
+            if sum(effect == name for effect, _ in most_sensitive) > 1:
+                label += f" {parameter.name.rpartition('.')[2]}"
             identifiability = _classify_parameter(label, False, parameter, half_width, confounders)
             if probe.is_single_size:
                 # The effect of a limit or backlash is not proportional to it; it shows if it is
@@ -288,13 +304,16 @@ class _IdentifiabilityAssessment:
         return assessments
 
 
-def _rate_switching_effect(noises: float) -> IdentifiabilityLevel:
-    """Return the level of a limit or backlash that changes the samples by this norm."""
-    if noises < MIN_DETECTABLE_LIMIT_SIGMAS:
+def _rate_switching_effect(norm: float) -> IdentifiabilityLevel:
+    """Return the level of a limit or backlash that changes all samples by a norm.
+
+    Args:
+        norm: norm of the change, in units of the noise.
+    """
+    if norm < MIN_DETECTABLE_LIMIT_SIGMAS:
         return "not identifiable"
-    return (
-        "weak" if noises < MIN_DETECTABLE_LIMIT_SIGMAS / MAX_IDENTIFIABLE_WIDTH else "identifiable"
-    )
+    is_weak = norm < MIN_DETECTABLE_LIMIT_SIGMAS / MAX_IDENTIFIABLE_WIDTH
+    return "weak" if is_weak else "identifiable"
 
 
 def _classify_parameter(
@@ -322,11 +341,12 @@ def _classify_parameter(
     level: IdentifiabilityLevel = "not identifiable"
     if share <= MAX_WEAK_WIDTH:
         level = "identifiable" if share <= MAX_IDENTIFIABLE_WIDTH else "weak"
-    strong_confounders = sorted(
-        (m for m in confounders if m[1] > CONFOUNDING_CORRELATION), key=lambda m: -m[1]
-    )
-    # Of several entries with one name, the strongest remains: it is the last in reversed order.
-    named_confounders = tuple(dict(strong_confounders[::-1]).items())[::-1][:MAX_NAMED_CONFOUNDERS]
+    correlation_by_name: dict[str, float] = {}
+    for other, correlation in sorted(confounders, key=lambda entry: entry[1], reverse=True):
+        if correlation > CONFOUNDING_CORRELATION:
+            # Of several entries with one name, the first one is the strongest.
+            correlation_by_name.setdefault(other, correlation)
+    named_confounders = tuple(correlation_by_name.items())[:MAX_NAMED_CONFOUNDERS]
     return ParameterIdentifiability(
         name, free, parameter.unit, float(half_width), low, high, level, named_confounders
     )
@@ -342,14 +362,16 @@ def format_identifiability(assessments: Sequence[ParameterIdentifiability]) -> l
     # A limit has no interval, and follows the causes that have one.
     identifiable = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
     lines += [f"  {_format_parameter(number)}" for number in identifiable[:MAX_LISTED_CAUSES]]
-    for level, members in (
-        ("also identifiable", identifiable[MAX_LISTED_CAUSES:]),
-        *list(causes.items())[1:],
-    ):
+    # The other causes are named only.
+    other_causes = {
+        "also identifiable": identifiable[MAX_LISTED_CAUSES:],
+        "weak": causes["weak"],
+        "not identifiable": causes["not identifiable"],
+    }
+    for level, members in other_causes.items():
         if members:
-            lines.append(
-                f"  {level}: {join_first_names(_count_effects(members), MAX_LISTED_CAUSES)}"
-            )
+            names = join_first_names(_count_effects(members), MAX_LISTED_CAUSES)
+            lines.append(f"  {level}: {names}")
     if any(len(members) > MAX_LISTED_CAUSES for members in causes.values()):
         lines.append("  all causes with their intervals: the same command with --json")
     return lines
@@ -360,13 +382,12 @@ def _format_parameter(number: ParameterIdentifiability) -> str:
 
     A limit or backlash has no interval (NaN), and a parameter without influence an infinite one.
     """
-    interval_text = (
-        f"±{number.half:.2g} {format_unit(number.unit)}".rstrip()
-        if np.isfinite(number.half)
-        else "no influence"
-    )
-    if np.isnan(number.half):
+    if np.isfinite(number.half):
+        interval_text = f"±{number.half:.2g} {format_unit(number.unit)}".rstrip()
+    elif np.isnan(number.half):
         interval_text = "a limit inside the range of the data"
+    else:
+        interval_text = "no influence"
     confounder_text = join_first_names([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
     confounding_note = f"; confounded with {confounder_text}" if confounder_text else ""
     span = f"{number.low:.3g} to {number.high:.3g}"
@@ -377,13 +398,19 @@ def _format_parameter(number: ParameterIdentifiability) -> str:
 
 
 def _count_effects(assessments: Sequence[ParameterIdentifiability]) -> list[str]:
-    """List the effects of causes once each, with the number of their places."""
+    """List the effects of causes once each, with the number of their places if there are several.
+
+    The name of a cause is that of its effect with its place, and of its coefficient after a space.
+    """
     places: dict[str, set[str]] = {}
     for number in assessments:
-        effect, _, place = number.name.partition(" ")[0].partition("@")
+        placed_effect, _, _ = number.name.partition(" ")
+        effect, _, place = placed_effect.partition("@")
         places.setdefault(effect, set()).add(place)
-    place_counts = {name: len(effect_places) for name, effect_places in places.items()}
-    return [f"{name} ({n} places)" if n > 1 else name for name, n in place_counts.items()]
+    return [
+        f"{effect} ({len(effect_places)} places)" if len(effect_places) > 1 else effect
+        for effect, effect_places in places.items()
+    ]
 
 
 _WORDS: tuple[IdentifiabilityLevel, ...] = ("identifiable", "weak", "not identifiable")
@@ -424,20 +451,15 @@ def freeze_unidentified_parameters(
     for iteration in range(MAX_REFITS):
         search = searching(base)
         unidentified = find_unidentified_parameters(search, search.base_model)
-        unidentified_indices = [
-            i
-            for i in evaluator.base_indices.tolist()
-            if evaluator.parameters[i].name in unidentified
-        ]
-        if not unidentified_indices:
+        index_by_name = {
+            evaluator.parameters[index].name: index for index in evaluator.base_indices.tolist()
+        }
+        # The names are sorted by the width of the intervals, the widest first.
+        frozen_indices = [index_by_name[name] for name in unidentified if name in index_by_name]
+        if not frozen_indices:
             break
-        # `unidentified` is sorted by the width of the intervals.
-        unidentified_indices.sort(key=lambda i: unidentified.index(evaluator.parameters[i].name))
-        frozen_indices = (
-            unidentified_indices
-            if iteration == MAX_REFITS - 1
-            else unidentified_indices[: (len(unidentified_indices) + 1) // 2]
-        )
+        if iteration < MAX_REFITS - 1:
+            frozen_indices = frozen_indices[: (len(frozen_indices) + 1) // 2]
         base = replace(
             base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_indices)
         ).refit_at_nominal(evaluator, noise, frozen_indices)

@@ -70,18 +70,23 @@ def format_cause(cause: Mapping[str, Any]) -> str:
 
 
 def format_log_table(rows: Sequence[LogResult]) -> str:
-    """Format the table of all logs as CSV, with one row for each number of each cause."""
+    """Format the table of all logs as CSV, with one row for each number of each cause.
+
+    A log without causes has one row, in which the cells of the cause are empty.
+    """
     lines: list[tuple[object, ...]] = []
     for row in rows:
-        cells: list[tuple[object, ...]] = []
+        cause_cells: list[tuple[object, ...]] = []
         for cause in row.causes:
-            for name, number in cause["coefficients"].items():
-                cause_cells = cause["effect"], " or ".join(cause["alternatives"]), name
-                cells.append(
-                    (*cause_cells, *(number[key] for key in ("value", "low", "high", "unit")))
-                )
+            alternatives = " or ".join(cause["alternatives"])
+            for coefficient, number in cause["coefficients"].items():
+                estimate = [number[key] for key in ("value", "low", "high", "unit")]
+                cause_cells.append((cause["effect"], alternatives, coefficient, *estimate))
         common_cells = row.gap_closed, row.seconds, row.error
-        lines += [(row.log, row.verdict, *cell, *common_cells) for cell in cells or [("",) * 7]]
+        no_cause = ("",) * 7
+        lines += [
+            (row.log, row.verdict, *cells, *common_cells) for cells in cause_cells or [no_cause]
+        ]
     return format_csv(LOG_COLUMNS, lines)
 
 
@@ -119,6 +124,7 @@ def _format_ranges(numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     parts = []
     for name, estimates in numbers.items():
         values = [estimate["value"] for estimate in estimates]
+        # Ends that are printed alike are printed once.
         ends = dict.fromkeys(format_number(end, 4) for end in (min(values), max(values)))
         label = "" if name == "coefficient" else f"{place_of(name)} "
         parts.append(label + append_unit(" to ".join(ends), estimates[0]["unit"]))
@@ -145,6 +151,9 @@ _MEASURED = ("gap_closed", "low", "high", "before", "after", "seconds")
 def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> pd.DataFrame:
     """Build a table with one row per log: its causes, its report and the share of the gap closed.
 
+    `before` and `after` are the errors on held-out runs of the base and the extended model, as
+    multiples of the noise floor; they are NaN if a log was not explained.
+
     Args:
         rows: Result of each log.
         folders: Folder of each log's explanation, by log.
@@ -152,15 +161,15 @@ def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> p
     lines = []
     for log_number, row in enumerate(rows, start=1):
         folder = folders[row.log]
-        error = _read_held_out_errors(folder) if not row.error else {}
+        errors = _read_held_out_errors(folder) if not row.error else {}
         report = "" if row.error else quote(f"{folder.name}/{REPORT_FILE}")
         lines.append({
             "number": log_number, "log": row.log, "verdict": row.verdict or "not explained",
             "causes": "; ".join(format_cause(cause) for cause in row.causes),
             "gap_closed": row.gap_closed,
-            "low": error.get("low"), "high": error.get("high"),
-            "before": _convert_to_noise_floors(error, "rmse_base"),
-            "after": _convert_to_noise_floors(error, "rmse_extended"),
+            "low": errors.get("low"), "high": errors.get("high"),
+            "before": _convert_to_noise_floors(errors, "rmse_base"),
+            "after": _convert_to_noise_floors(errors, "rmse_extended"),
             "seconds": row.seconds, "error": row.error, "report": report,
         })  # fmt: skip
     frame = pd.DataFrame(lines, columns=["number", *_TEXTS, *_MEASURED])
@@ -184,14 +193,14 @@ def _read_held_out_errors(folder: Path) -> dict[str, float]:
         return {}
 
 
-def _convert_to_noise_floors(error: Mapping[str, float], key: str) -> float | None:
-    """Convert a held-out error to noise floors.
+def _convert_to_noise_floors(errors: Mapping[str, float], key: str) -> float | None:
+    """Return a held-out error as a multiple of the noise floor; None if one of them is unknown.
 
     Args:
-        error: held-out errors in the unit of the channel, and ``noise_floor``, by name.
+        errors: held-out errors in the unit of the channel, and ``noise_floor``, by name.
         key: name of the error.
     """
-    value, floor = error.get(key), error.get("noise_floor")
+    value, floor = errors.get(key), errors.get("noise_floor")
     return value / floor if value is not None and floor else None
 
 
@@ -212,18 +221,20 @@ def build_number_table(rows: Sequence[LogResult]) -> pd.DataFrame:
         for cause in row.causes:
             for name, estimate in cause["coefficients"].items():
                 label = format_label(place_of(name), estimate["unit"], LONGEST_NAME)
-                label_with_cause = f"{format_cause(cause)}: {label}"
-                cells = {
-                    "cause": format_cause(cause),
-                    "name": name,
-                    "what": label_with_cause,
-                    **estimate,
-                }
-                lines.append({"number": log_number, "log": row.log, **cells})
+                lines.append(
+                    {
+                        "number": log_number,
+                        "log": row.log,
+                        "cause": format_cause(cause),
+                        "name": name,
+                        "what": f"{format_cause(cause)}: {label}",
+                        **estimate,
+                    }
+                )
     columns = ["number", "log", "cause", "name", "what", "value", "low", "high", "unit"]
     frame = pd.DataFrame(lines, columns=columns)
     frame = frame.astype(dict.fromkeys(["value", "low", "high"], float))
-    # The commonest number first.
+    # The number that most logs have comes first.
     frequency = frame["what"].map(frame["what"].value_counts())
     order = frequency.sort_values(ascending=False, kind="stable").index
     return frame.loc[order].reset_index(drop=True)
@@ -303,27 +314,27 @@ def explain_batch(
     results_by_log = _load_previous_results(out, logs)
     for row in results_by_log.values():
         report_result(row)
+
+    def write_results() -> list[LogResult]:
+        """Write the results so far, and return them in the order of the logs."""
+        results = [results_by_log[log.name] for log in logs if log.name in results_by_log]
+        _write_results(out, results)
+        return results
+
     remaining = [log for log in logs if log.name not in results_by_log]
     # A worker process does not know the figure settings of this process.
     calls = [(explain_log, (log, dict(settings), is_pdf_wanted())) for log in remaining]
     for index, result in pool.iterate_results(calls, np.inf):
         log = remaining[index]
-        row = (
-            result
-            if isinstance(result, LogResult)
-            else LogResult(log.name, log.digest, error=_format_error(result))
-        )
-        results_by_log[log.name] = row
-        ordered_results = [
-            results_by_log[batch_log.name] for batch_log in logs if batch_log.name in results_by_log
-        ]
-        _write_results(out, ordered_results)
-        report_result(row)
+        # The pool returns the exception of a call that failed.
+        if not isinstance(result, LogResult):
+            result = LogResult(log.name, log.digest, error=_format_error(result))
+        results_by_log[log.name] = result
+        write_results()
+        report_result(result)
         if stop():
             break
-    ordered_results = [results_by_log[log.name] for log in logs if log.name in results_by_log]
-    _write_results(out, ordered_results)
-    return ordered_results
+    return write_results()
 
 
 def explain_log(log: BatchLog, settings: Mapping[str, Any], pdf: bool = False) -> LogResult:
@@ -343,10 +354,13 @@ def explain_log(log: BatchLog, settings: Mapping[str, Any], pdf: bool = False) -
         return LogResult(log.name, log.digest, error=get_first_line(error))
     document = explanation.answer.to_document()
     held_out = document["heldout"]
-    gap_closed = held_out["gap_closed"] if held_out else None
-    causes = tuple(document["causes"])
     return LogResult(
-        log.name, log.digest, document["verdict"], causes, gap_closed, document["seconds"]
+        log=log.name,
+        digest=log.digest,
+        verdict=document["verdict"],
+        causes=tuple(document["causes"]),
+        gap_closed=held_out["gap_closed"] if held_out else None,
+        seconds=document["seconds"],
     )
 
 
@@ -359,7 +373,8 @@ def _format_error(error: object) -> str:
 def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, LogResult]:
     """Load the results of an earlier call in an output folder, to explain only what has changed.
 
-    A result is reused if its log and all settings are the same and it has no error.
+    A result is reused if its log and all settings, by their digest, are the same and it has no
+    error.
 
     Args:
         out: output folder of the batch; a folder with other files is refused.
@@ -376,14 +391,13 @@ def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, Log
         stored_results = [LogResult.from_document(row) for row in json.loads(path.read_text())]
     except (OSError, ValueError, TypeError):
         raise InputError(f"{path}: was not written by simgap; name another folder") from None
-    by_name = {row.log: row for row in stored_results}
-    unchanged = {log.name: by_name[log.name] for log in logs if log.name in by_name}
-    digests = {log.name: log.digest for log in logs}
-    return {
-        name: row
-        for name, row in unchanged.items()
-        if row.digest == digests[name] and not row.error
-    }
+    stored_by_log = {result.log: result for result in stored_results}
+    reused = {}
+    for log in logs:
+        result = stored_by_log.get(log.name)
+        if result is not None and result.digest == log.digest and not result.error:
+            reused[log.name] = result
+    return reused
 
 
 def _write_results(out: Path, rows: Sequence[LogResult]) -> None:

@@ -96,6 +96,7 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
     number_table = many_logs.build_number_table(rows)
     causes = many_logs.list_common_causes(rows)
     charts = make_summary_charts(logs, number_table)
+    # Panels and captions of the printed figures.
     printed = {
         "numbers": (
             charts.numbers[:MAX_PANELS],
@@ -106,15 +107,12 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
             "Dashed: the noise floor, the best that any model can reach.",
         ),
     }
-    page = HtmlPage(
-        {
-            name: figure_output.render_all_formats(
-                draw_summary_figure(panels, charts.tables, caption)
-            )
-            for name, (panels, caption) in printed.items()
-            if panels
-        }
-    )
+    figures = {}
+    for name, (panels, caption) in printed.items():
+        if panels:
+            figure = draw_summary_figure(panels, charts.tables, caption)
+            figures[name] = figure_output.render_all_formats(figure)
+    page = HtmlPage(figures)
     page.add_tables({"each": logs, "logs": many_logs.read_log_table(rows), **charts.tables})
     return page.render(
         _TEMPLATE,
@@ -185,6 +183,8 @@ def _make_log_axis(logs: pd.DataFrame) -> Axis:
 def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
     """Make a panel for each number of a cause, the most common first.
 
+    A panel has a point with its interval for each log.
+
     Args:
         numbers: one row for each coefficient of a cause of a log.
         across: horizontal axis with the logs.
@@ -192,7 +192,7 @@ def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
     panels = []
     for label_with_cause in dict.fromkeys(numbers["what"].astype(str)):
         name, _, label = label_with_cause.rpartition(": ")
-        # A point with its interval for each log; the columns are those of the table "found".
+        # Names of columns are those of the table "found" in `SummaryCharts`.
         series = (
             Series(
                 "each log",
@@ -253,8 +253,9 @@ def draw_summary_figure(
         tables: Tables of the panels.
         caption: Caption below the figure.
     """
-    # Height in inches: title and axis, and a line for each log.
-    height = 1.2 + _NAME_HEIGHT * len(panels[0].across.names) if panels[0].across.names else 4.0
+    # Height in inches: title and axis, and a line for each log that is named.
+    log_names = panels[0].across.names
+    height = 1.2 + _NAME_HEIGHT * len(log_names) if log_names else 4.0
     figure, axes = draw_chart(panels, tables, size=(3.4, height), horizontal=True)
     for axis, panel in zip(axes, panels, strict=True):
         axis.set_title(break_name(panel.title, _TITLE_LINE), fontsize=8.5, parse_math=False)

@@ -67,8 +67,10 @@ def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float])
         finer: The two values with the finer step. Far from the noise floor, autocorrelated
             residuals bias the likelihood, so the residual must be smaller too.
     """
-    merits, excesses = zip(file, finer, strict=True)
-    return not is_indistinguishable(merits[1] - merits[0]) and improves_held_out(merits, excesses)
+    (file_merit, file_excess), (finer_merit, finer_excess) = file, finer
+    return not is_indistinguishable(finer_merit - file_merit) and improves_held_out(
+        (file_merit, finer_merit), (file_excess, finer_excess)
+    )
 
 
 class CoarseStepFinding(NamedTuple):
@@ -127,10 +129,9 @@ def list_option_causes(finding: OptionFinding) -> list[Cause]:
     causes = []
     for effect, (stated, number) in list_changed_options(kind.robot, kind.numerics).items():
         option = OPTION_EFFECTS[effect]
-        before, after = (
-            value if isinstance(value, str) else f"{value:g}"
-            for value in (format_option(option, stated), format_option(option, number))
-        )
+        # Some options are words, such as a solver; others are numbers.
+        options = format_option(option, stated), format_option(option, number)
+        before, after = (value if isinstance(value, str) else f"{value:g}" for value in options)
         description = f"{option} = {after} explains the recording, the model file has {before}"
         coefficients = {"coefficient": make_option_value(effect, stated, number)}
         causes.append(Cause(effect, (), description, coefficients, p_value))
@@ -139,6 +140,8 @@ def list_option_causes(finding: OptionFinding) -> list[Cause]:
 
 def list_step_causes(coarse: CoarseStepFinding) -> list[Cause]:
     """Return the integrator and the time step as causes if they differ from the model file.
+
+    An integrator has its MuJoCo number as coefficient; both are chosen, so they have no interval.
 
     Args:
         coarse: Finding that the file's step is too coarse.

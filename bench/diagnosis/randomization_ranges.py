@@ -120,8 +120,8 @@ class _Entry(NamedTuple):
 def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> RandomizationRanges:
     """Return the ranges of the fitted numbers of diagnosed causes and of free numbers.
 
-    Numbers of the solver, ambiguous causes and numbers without an interval are left out, with the
-    reason.
+    Numbers of the solver are left out. So are ambiguous causes and numbers without an interval,
+    with the reason.
 
     Args:
         answer: Verdict. A cause with alternatives is ambiguous, and is left out.
@@ -146,21 +146,26 @@ def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> R
         for name, numbers in collect_causes(extended).items()
         if not name.startswith("numerics.")
     }
-    # Each cause at one place, whether the user freed it, and whether it gets a range.
+    # A cause at several places (a family) is divided into causes at one place each.
     causes = [
-        (cause, name in freed_effects, name in freed_effects or name in unambiguous_effects)
+        (name, cause)
         for name, numbers in causes_by_name.items()
         for cause in expand_families(kind.robot, {name: numbers})
     ]
     ranges = []
-    totals = _Totals(kind, [cause for cause, _, _ in causes])
-    for number, (cause, is_free, is_wanted) in enumerate(causes):
-        for coefficient, fitted in cause.numbers.items() if is_wanted else ():
+    totals = _Totals(kind, [cause for _, cause in causes])
+    for cause_index, (name, cause) in enumerate(causes):
+        is_free = name in freed_effects
+        if not is_free and name not in unambiguous_effects:
+            continue
+        for coefficient, fitted in cause.numbers.items():
             entry = _Entry(cause, is_free, coefficient)
-            if reason := _find_missing_range_reason(fitted, entry):
-                left_out += [reason] if is_free or fitted.value or fitted.at_bound else []
-            else:
-                ranges.append(_convert_to_range(kind.robot, totals, number, entry))
+            reason = _find_missing_range_reason(fitted, entry)
+            if not reason:
+                ranges.append(_convert_to_range(kind.robot, totals, cause_index, entry))
+            # A coefficient of a cause that was never fitted needs no reason.
+            elif is_free or fitted.value or fitted.at_bound:
+                left_out.append(reason)
     if ranges and not any(number_range.fields for number_range in ranges):
         left_out.append(NO_FIELD)
     if not ranges:
@@ -205,29 +210,31 @@ class _Totals:
             for effect, cause in zip(self.effects, causes, strict=True)
         ]
 
-    def at(self, number: int, coefficient: str, value: float) -> tuple[float | None, float, str]:
-        """Return the file's number before and after one coefficient is changed, and its unit.
+    def at(
+        self, cause_index: int, coefficient: str, value: float
+    ) -> tuple[float | None, float, str]:
+        """Return a number of the model file as stated and with a changed coefficient, and its unit.
 
-        An interval of a coefficient is converted to an interval of the number in this way, with all
-        other effects applied. If the file has no such number, the result is None and the
-        coefficient itself.
+        The second value has all other effects applied. The ends of an interval of a coefficient are
+        converted to those of the number in this way. If the file has no such number, the result is
+        None and the coefficient itself.
 
         Args:
-            number: Index of the cause.
+            cause_index: Index of the cause.
             coefficient: Coefficient of the cause that is changed.
             value: Value of the coefficient.
         """
         from sims.robot.export.model_file_totals import compute_file_totals
 
         values = [dict(coefficients) for coefficients in self.values]
-        values[number][coefficient] = value
+        values[cause_index][coefficient] = value
         fitted = [
             (effect, list(coefficients.values()))
             for effect, coefficients in zip(self.effects, values, strict=True)
         ]
-        effect = self.effects[number]
+        effect = self.effects[cause_index]
         index = [c.name for c in effect.coefficients].index(coefficient)
-        number_total = compute_file_totals(self.robot, fitted)[number][index]
+        number_total = compute_file_totals(self.robot, fitted)[cause_index][index]
         if number_total is not None:
             return number_total.stated, number_total.total, number_total.unit
         return None, value, effect.coefficients[index].units[0] or "1"
@@ -244,7 +251,7 @@ def _get_value(numbers: Mapping[str, FittedValue], coefficient: str) -> float:
 
 
 def _convert_to_range(
-    robot: RobotModel, totals: _Totals, number: int, entry: _Entry
+    robot: RobotModel, totals: _Totals, cause_index: int, entry: _Entry
 ) -> RandomizationRange:
     """Convert the interval of a fitted coefficient to a range of the number in the model file.
 
@@ -254,7 +261,7 @@ def _convert_to_range(
     Args:
         robot: model of the robot.
         totals: numbers of the model file with all effects applied.
-        number: index of the cause in `totals`.
+        cause_index: index of the cause in `totals`.
         entry: the coefficient and its cause.
     """
     from sims.robot.model_field_effects import model_fields, operation_of
@@ -262,16 +269,16 @@ def _convert_to_range(
     cause, fitted = entry.cause, entry.cause.numbers[entry.coefficient]
     assert fitted.low is not None
     assert fitted.high is not None
-    effect = totals.effects[number]
-    names = [c.name for c in effect.coefficients]
+    effect = totals.effects[cause_index]
+    # Elements of the compiled model for each coefficient of the effect, if there are any.
     fields = model_fields(robot, cause.effect, cause.place)
+    names = [c.name for c in effect.coefficients]
     own_fields = tuple(fields[names.index(entry.coefficient)]) if fields else ()
-    nominal, value, unit = totals.at(number, entry.coefficient, fitted.value)
-    # Both ends of the interval as numbers of the file; the order may be reversed.
-    interval_ends = (
-        totals.at(number, entry.coefficient, end)[1] for end in (fitted.low, fitted.high)
-    )
-    low, high = sorted(interval_ends)
+    nominal, value, unit = totals.at(cause_index, entry.coefficient, fitted.value)
+    # Ends of the interval as numbers of the file, whose order may be reversed.
+    _, first_end, _ = totals.at(cause_index, entry.coefficient, fitted.low)
+    _, second_end, _ = totals.at(cause_index, entry.coefficient, fitted.high)
+    low, high = sorted((first_end, second_end))
     operation = operation_of(cause.effect)
     minimum, maximum = low, high
     if operation == "add" and nominal is not None:
@@ -299,21 +306,22 @@ def _convert_to_range(
 def describe_ranges(
     ranges: RandomizationRanges,
 ) -> Iterator[tuple[RandomizationRange, str]]:
-    """Yield each range with a line of text: quantity, place, value, range, unit and cause."""
+    """Yield each range with a line of text, such as ``dof_damping of joint elbow: ...``.
+
+    The text has the value in the model file if there is one, the value with the effect and its
+    range, the unit, and the cause.
+    """
     for number_range in ranges.ranges:
-        place_text = (
-            f"{number_range.kind} {number_range.name}" if number_range.name else "the world"
-        )
+        place_text = "the world"
+        if number_range.name:
+            place_text = f"{number_range.kind} {number_range.name}"
         quantity = number_range.field or f"effect {number_range.effect}"
         # An effect with a single coefficient calls it "coefficient", which says nothing.
-        quantity += (
-            "" if number_range.coefficient == "coefficient" else f" ({number_range.coefficient})"
-        )
-        value_in_file = (
-            ""
-            if number_range.nominal is None
-            else f"{number_range.nominal:.4g} in the model file, "
-        )
+        if number_range.coefficient != "coefficient":
+            quantity += f" ({number_range.coefficient})"
+        value_in_file = ""
+        if number_range.nominal is not None:
+            value_in_file = f"{number_range.nominal:.4g} in the model file, "
         unit = "" if number_range.unit == "1" else f" {number_range.unit}"
         yield (
             number_range,

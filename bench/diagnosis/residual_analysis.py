@@ -64,20 +64,21 @@ def compute_gap_locations(
         sigma: (C,) noise of each channel.
         mark: Text that is appended to the names of runs.
     """
-    parts = _list_parts(evaluator, after, mark)
-    residuals = [(evaluator.observed - simulated) / sigma for simulated in (before, after)]
-    locations = []
-    for kind, label, mask in parts:
+    before_squares, after_squares = (
+        np.square((evaluator.observed - simulated) / sigma) for simulated in (before, after)
+    )
+    return [
+        GapLocation(
+            kind,
+            label,
+            samples=int(mask.sum()),
+            before=float(np.sqrt(before_squares[mask].mean())),
+            after=float(np.sqrt(after_squares[mask].mean())),
+        )
+        for kind, label, mask in _list_parts(evaluator, after, mark)
         # A run or phase without samples has no RMS.
-        if not mask.any():
-            continue
-        rms_values = []
-        for residual in residuals:
-            square = np.square(residual[mask]).mean()
-            rms_values.append(float(np.sqrt(square)))
-        samples = int(mask.sum())
-        locations.append(GapLocation(kind, label, samples, *rms_values))
-    return locations
+        if mask.any()
+    ]
 
 
 def _list_parts(
@@ -95,14 +96,14 @@ def _list_parts(
         mark: text that is appended to the names of runs.
     """
     observed_mask = np.isfinite(evaluator.observed)
-    runs, _, channels = observed_mask.shape
+    run_count, _, channel_count = observed_mask.shape
     data_parts: list[tuple[str, str, Mask]] = []
-    for r, run_data in enumerate(evaluator.prepared_runs):
-        is_this_run = np.arange(runs) == r
+    for run_index, run_data in enumerate(evaluator.prepared_runs):
+        is_this_run = np.arange(run_count) == run_index
         mask = observed_mask & is_this_run[:, None, None]
         data_parts.append(("run", run_data.name + mark, mask))
-    for c, name in enumerate(evaluator.channels):
-        is_this_channel = np.arange(channels) == c
+    for channel_index, name in enumerate(evaluator.channels):
+        is_this_channel = np.arange(channel_count) == channel_index
         data_parts.append(("channel", name, observed_mask & is_this_channel))
     # Phases come from the simulation, because noise of a measured speed would cause false ones.
     for phase, phase_mask in detect_phases(evaluator, simulated).items():
@@ -114,7 +115,8 @@ def detect_phases(evaluator: RunEvaluator, simulated: Array) -> dict[str, Mask]:
     """Detect phases of the motion as masks (R, T).
 
     They are flight, impact and at rest for a system that bounces; motion, reversal and at rest for
-    others; and saturated input.
+    others. A further phase, saturated input, may overlap with each of them. Without recorded
+    coordinates there are no phases.
 
     Shapes: R runs, T samples, C channels.
 
@@ -136,7 +138,6 @@ def detect_phases(evaluator: RunEvaluator, simulated: Array) -> dict[str, Mask]:
     else:
         reversal = (speed < REVERSAL_SPEED_SHARE * largest) & ~is_at_rest
         masks = {"motion": ~reversal & ~is_at_rest, "reversal": reversal, "at rest": is_at_rest}
-    # This phase may overlap with the others, because an input can saturate in each of them.
     saturated = _find_saturation(evaluator)
     if saturated.any():
         masks["saturated input"] = saturated
@@ -155,9 +156,14 @@ def compute_speeds(evaluator: RunEvaluator, simulated: Array) -> Array | None:
     Returns:
         Speed, 0 after the end of a run; None without recorded coordinates.
     """
-    recorded = [n for n in evaluator.simulator.system.coordinates if n in evaluator.channels]
-    slopes = [_compute_slopes(evaluator, simulated, name) for name in recorded]
-    return np.sqrt(np.nan_to_num(np.square(slopes).sum(axis=0))) if recorded else None
+    velocities = [
+        _compute_slopes(evaluator, simulated, name)
+        for name in evaluator.simulator.system.coordinates
+        if name in evaluator.channels
+    ]
+    if not velocities:
+        return None
+    return np.sqrt(np.nan_to_num(np.square(velocities).sum(axis=0)))
 
 
 def _compute_slopes(evaluator: RunEvaluator, simulated: Array, channel: str) -> Array:
@@ -193,7 +199,8 @@ def _find_lasting_stretches(mask: Mask) -> Mask:
 def _find_impacts(evaluator: RunEvaluator, simulated: Array) -> Mask:
     """Return the mask (R, T) of the samples around each minimum of the simulated height.
 
-    A ball touches the ground there; a few samples on either side are included.
+    A ball touches the ground there; a few samples on either side are included. The height is the
+    last coordinate; nothing is marked if it is not recorded.
 
     Shapes: R runs, T samples, C channels.
 
@@ -220,7 +227,8 @@ def _find_impacts(evaluator: RunEvaluator, simulated: Array) -> Mask:
 def _find_saturation(evaluator: RunEvaluator) -> Mask:
     """Return the mask (R, T) of samples at which the first input stays near its largest magnitude.
 
-    It is empty for an input that is there most of the time, such as a square wave.
+    It is all False for an input that is there most of the time, such as a constant or a square
+    wave, which is not saturated.
 
     Shapes: R runs, T samples.
 
@@ -228,13 +236,12 @@ def _find_saturation(evaluator: RunEvaluator) -> Mask:
         evaluator: Run evaluator of the recording.
     """
     mask = np.zeros(evaluator.observed.shape[:2], dtype=bool)
-    for r, run_data in enumerate(evaluator.prepared_runs):
+    for run_mask, run_data in zip(mask, evaluator.prepared_runs, strict=True):
         for signal in list(run_data.scenario.inputs.values())[:1]:
             size = np.abs(signal)
             largest = max(float(size.max()), 1e-300)
-            mask[r, : signal.size] = (size >= SATURATION_SHARE * largest) & (size > 0)
+            run_mask[: signal.size] = (size >= SATURATION_SHARE * largest) & (size > 0)
     lasting = _find_lasting_stretches(mask)
-    # A constant or square input is always at its extreme, which is not saturation.
     return lasting if lasting.mean() < 0.5 else np.zeros_like(mask)
 
 
@@ -245,7 +252,8 @@ def compute_residual_profiles(
 
     A profile is the mean residual of a channel in bins of such a variable, and shows on what a
     missing force depends. The channel is the one that sensor effects act on. For a robot it is the
-    one with the largest gap, against the variables of its joint.
+    one with the largest gap, against the variables of its joint. A variable that does not change
+    has no profile.
 
     Shapes: R runs, T samples, C channels.
 
@@ -272,17 +280,21 @@ def compute_residual_profiles(
         bin_indices = np.searchsorted(edges, variable_values, side="right") - 1
         bins = np.clip(bin_indices, 0, PROFILE_BIN_COUNT - 1)
         counts = np.bincount(bins, minlength=PROFILE_BIN_COUNT).astype(np.float64)
+        before_residual, after_residual = (
+            (evaluator.observed - simulated)[:, :, channel_index][is_finite]
+            for simulated in (before, after)
+        )
         # The mean of an empty bin is NaN and is not drawn.
         with np.errstate(invalid="ignore", divide="ignore"):
-            means = []
-            for simulated in (before, after):
-                residual = (evaluator.observed - simulated)[:, :, channel_index][is_finite]
-                means.append(np.bincount(bins, residual, PROFILE_BIN_COUNT) / counts)
-            standard_error = sigma[channel_index] / np.sqrt(counts)
-        standard_error[counts == 0] = np.nan
+            before_means = np.bincount(bins, before_residual, PROFILE_BIN_COUNT) / counts
+            after_means = np.bincount(bins, after_residual, PROFILE_BIN_COUNT) / counts
+            standard_errors = sigma[channel_index] / np.sqrt(counts)
+        standard_errors[counts == 0] = np.nan
         centres = (edges[1:] + edges[:-1]) / 2.0
         profiles.append(
-            ResidualProfile(name, variable, unit, centres, means[0], means[1], standard_error)
+            ResidualProfile(
+                name, variable, unit, centres, before_means, after_means, standard_errors
+            )
         )
     return profiles
 
@@ -327,7 +339,8 @@ def _iterate_variables(
 ) -> Iterator[tuple[str, str, Array]]:
     """Yield the variables of residual profiles, each with name, unit and values (R, T).
 
-    They are the time, the position, the speed, and each recorded input.
+    They are the time, the position along the primary coordinate, the speed, and each recorded
+    input. Values are NaN after the end of a run.
 
     Shapes: R runs, T samples, C channels.
 
@@ -371,11 +384,13 @@ def _iterate_inputs(
         names: names of the inputs.
     """
     for channel in evaluator.kind.inputs:
+        if channel.name not in names:
+            continue
         values = np.full(evaluator.observed.shape[:2], np.nan)
-        for r, run_data in enumerate(evaluator.prepared_runs):
+        for run_values, run_data in zip(values, evaluator.prepared_runs, strict=True):
             signal = run_data.scenario.inputs.get(channel.name)
-            if signal is not None and channel.name in names:
-                values[r, : len(run_data.observed)] = signal
+            if signal is not None:
+                run_values[: len(run_data.observed)] = signal
         if np.isfinite(values).any():
             yield channel.name, channel.unit, values
 
@@ -385,7 +400,9 @@ def _iterate_joint_variables(
 ) -> Iterator[tuple[str, str, Array]]:
     """Yield the variables for residual profiles of a joint's channel: name, unit and values (R, T).
 
-    The velocity has its sign, because friction acts against it.
+    They are the time, the position, the velocity with its sign, because friction acts against it,
+    and the recorded inputs that act on the joint. A channel that is not one of a joint has only the
+    time.
 
     Shapes: R runs, T samples, C channels.
 
@@ -398,7 +415,8 @@ def _iterate_joint_variables(
     yield "time", "s", times
     robot = get_robot(evaluator)
     joints = robot.joints if robot is not None else ()
-    joint = next((j for j in joints if j.name == channel.partition(".")[2]), None)
+    _, _, joint_name = channel.partition(".")
+    joint = next((joint for joint in joints if joint.name == joint_name), None)
     if robot is None or joint is None:
         return
     position, rate = f"q.{joint.name}", f"qd.{joint.name}"
@@ -408,8 +426,11 @@ def _iterate_joint_variables(
         yield f"position of {joint.name}", unit, values
         slopes = _compute_slopes(evaluator, simulated, position)
         yield f"velocity of {joint.name}", f"{unit}/s", slopes
+    # Without a recorded position, the simulated velocity is that of its channel.
     elif rate in evaluator.channels:
         values = simulated[:, :, evaluator.channels.index(rate)]
         yield f"velocity of {joint.name}", f"{unit}/s", values
-    drives = [f"u.{a.name}" for a in robot.actuators if a.joint == joint.name]
-    yield from _iterate_inputs(evaluator, [*drives, f"force.{joint.name}"])
+    commands = [
+        f"u.{actuator.name}" for actuator in robot.actuators if actuator.joint == joint.name
+    ]
+    yield from _iterate_inputs(evaluator, [*commands, f"force.{joint.name}"])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -53,72 +53,97 @@ def score_model(
     Raises:
         InputError: A file cannot be read, or the recording is of another system.
     """
-    recording_in_memory = recording if isinstance(recording, Recording) else None
     path = recording.path if isinstance(recording, Recording) else Path(recording)
-    if model.suffix not in MODEL_FILES:
-        _check_plugin(model)
     # The description names the system of the recording before the table is read.
     model_reference = (
-        recording_in_memory.model if recording_in_memory is not None else read_model_reference(path)
+        recording.model if isinstance(recording, Recording) else read_model_reference(path)
     )
     if model.suffix in MODEL_FILES:
         extended, kind = _load_robot(model, model_reference)
     else:
+        _check_plugin(model)
         extended, kind, _ = open_extended(model, simulators.get)
         # A recording of another robot is recognised by its channels.
         if model_reference is None or extended.robot is None:
-            _check_system(
-                path,
-                _get_system_name(recording_in_memory or path, model_reference),
-                extended,
-                model,
-            )
+            source = recording if isinstance(recording, Recording) else path
+            _check_system(path, _get_system_name(source, model_reference), extended, model)
     # All runs count by default, because only initial states are fitted here.
-    recording_used = recording_in_memory or read_recording(path, kind, whole=True)
-    # Constants of the recording take precedence over those that the model was fitted with.
-    recording_used = replace(
-        recording_used, constants={**extended.constants, **recording_used.constants}
+    scored = (
+        recording if isinstance(recording, Recording) else read_recording(path, kind, whole=True)
     )
-    recording_used, _ = leave_out_settling(recording_used, kind)
-    runs = recording_used.held_out() if held_out else recording_used.runs
+    # Constants of the recording take precedence over those that the model was fitted with.
+    scored = replace(scored, constants={**extended.constants, **scored.constants})
+    scored, _ = leave_out_settling(scored, kind)
+    runs = scored.held_out() if held_out else scored.runs
     if not runs:
         raise InputError(f"{path}: no run is marked held_out, and only such runs were to count")
     _check_channels(path, extended, list(runs[0].channels))
     engine = None if kind.own_engine else extended.engine
-    check_value_sizes(recording_used)
-    check_recording_plausible(recording_used, kind, force)
-    check_recording_size(recording_used, kind(engine=engine), force)
-
-    def score(recording: Recording) -> tuple[RunEvaluator, Array, Array]:
-        """Return the evaluator of the runs, the squared errors, and the noise."""
-        counted = recording.held_out() if held_out else recording.runs
-        # Only the effects in the file are needed; the others are not part of the model.
-        evaluator = RunEvaluator(
-            kind, recording, counted, engine, candidates=list(extended.effects)
-        )
-        sigma = compute_noise_floor(evaluator, recording).sigma
-        squares = _compute_squared_errors(evaluator, _simulate_runs(evaluator, extended, sigma))
-        evaluator.close()
-        return evaluator, squares, sigma
-
-    def compute_cost(scored: tuple[RunEvaluator, Array, Array]) -> float:
-        """Return the sum of squared errors in units of the noise of each channel."""
-        _, squares, sigma = scored
-        return float((squares / np.square(sigma)).sum())
-
-    scored_versions = [score(recording_used)]
+    check_value_sizes(scored)
+    check_recording_plausible(scored, kind, force)
+    check_recording_size(scored, kind(engine=engine), force)
+    versions = [scored]
     if kind.has_model:
-        filled, note = fill_lost_commands(recording_used)
+        filled, note = fill_lost_commands(scored)
         # Commands of lost rows were held or sent; the smaller error tells which.
-        scored_versions += [score(filled)] if note else []
-    evaluator, squares, sigma = min(scored_versions, key=compute_cost)
-    if not np.isfinite(squares).all():
+        versions += [filled] if note else []
+    errors = min(
+        (_compute_errors(version, kind, engine, extended, held_out) for version in versions),
+        key=_ScoredRuns.compute_cost,
+    )
+    if not np.isfinite(errors.squares).all():
         raise InputError(f"{path}: the simulation failed with the parameters of {model}")
-    return _summarise_errors(evaluator, squares, sigma)
+    return _summarise_errors(errors)
+
+
+class _ScoredRuns(NamedTuple):
+    """Errors of a model on the runs that count.
+
+    Attributes:
+        evaluator: Closed run evaluator of the runs.
+        squares: (R, T, C) squared errors; zero where no sample was observed.
+        sigma: (C,) standard deviation of the noise of each channel.
+    """
+
+    evaluator: RunEvaluator
+    squares: Array
+    sigma: Array
+
+    def compute_cost(self) -> float:
+        """Return the sum of squared errors in units of the noise of each channel."""
+        return float((self.squares / np.square(self.sigma)).sum())
+
+
+def _compute_errors(
+    recording: Recording,
+    kind: type[SystemSimulator],
+    engine: str | None,
+    extended: ExtendedSimulator,
+    held_out: bool,
+) -> _ScoredRuns:
+    """Simulate the runs with the numbers of a model, from fitted initial states.
+
+    Args:
+        recording: the recording.
+        kind: simulator class of the model.
+        engine: engine of the simulation; None for a simulator that steps itself.
+        extended: extended simulator, with its parameters and coefficients.
+        held_out: whether only held-out runs count.
+    """
+    runs = recording.held_out() if held_out else recording.runs
+    # Only the effects in the file are needed; the others are not part of the model.
+    evaluator = RunEvaluator(kind, recording, runs, engine, candidates=list(extended.effects))
+    sigma = compute_noise_floor(evaluator, recording).sigma
+    fitted_runs = HeldOutRuns(evaluator, NoiseModel.make_white(sigma))
+    (prediction,) = fitted_runs.fit_initial_states([build_theta(evaluator, extended)])
+    errors = evaluator.observed - prediction.simulated
+    squares = np.where(np.isfinite(evaluator.observed), np.square(errors), 0.0)
+    evaluator.close()
+    return _ScoredRuns(evaluator, squares, sigma)
 
 
 def _check_plugin(model: Path) -> None:
-    """Refuse the model of a user-defined simulator whose plugin is not loaded.
+    """Refuse an extended.toml of a user-defined simulator whose plugin is not loaded.
 
     Raises:
         InputError: The plugin is missing; the message names the option, with the plugin given to
@@ -143,7 +168,8 @@ def _load_robot(
 ) -> tuple[ExtendedSimulator, type[SystemSimulator]]:
     """Load a robot from its model file as a simulator, without fitted parameters and added effects.
 
-    The description of the recording may add actuators that the file does not have.
+    The description of the recording may add actuators that the file does not have, and integrator
+    settings for a URDF file.
 
     Args:
         model: the model file.
@@ -152,11 +178,11 @@ def _load_robot(
     """
     from sims.robot.parsing.read_model_file import read_robot
 
-    tables = reference.actuators if reference else {}
+    described_actuators = reference.actuators if reference else {}
     # A file written by explain contains the actuators of the recording already.
     present_actuators = {actuator.name for actuator in read_robot(model).actuators}
     missing_actuators = {
-        name: table for name, table in tables.items() if name not in present_actuators
+        name: table for name, table in described_actuators.items() if name not in present_actuators
     }
     # An MJCF contains its own step and integrator, which may be a result of the diagnosis.
     engine = reference.engine if reference else {}
@@ -247,46 +273,9 @@ def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
     return theta
 
 
-def _simulate_runs(evaluator: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -> Array:
-    """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states.
-
-    Shapes: R runs, T samples, C channels.
-
-    Args:
-        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        extended: extended simulator, with its parameters and coefficients.
-        sigma: (C,) standard deviation of the noise, which weights the channels.
-    """
-    runs = HeldOutRuns(evaluator, NoiseModel.make_white(sigma))
-    (prediction,) = runs.fit_initial_states([build_theta(evaluator, extended)])
-    return prediction.simulated
-
-
-def _compute_squared_errors(evaluator: RunEvaluator, simulated: Array) -> Array:
-    """Compute the squared errors (R, T, C); zero where no sample was observed.
-
-    Shapes: R runs, T samples, C channels.
-
-    Args:
-        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        simulated: (R, T, C) simulated channels.
-    """
-    observed_mask = np.isfinite(evaluator.observed)
-    errors = evaluator.observed - simulated
-    squares: Array = np.where(observed_mask, np.square(errors), 0.0)
-    return squares
-
-
-def _summarise_errors(evaluator: RunEvaluator, squares: Array, sigma: Array) -> dict[str, Any]:
-    """Summarise the RMS error of each channel, and that of all in units of the noise.
-
-    Shapes: R runs, T samples, C channels.
-
-    Args:
-        evaluator: run evaluator with the recorded runs.
-        squares: (R, T, C) squared errors, zero where no sample exists.
-        sigma: (C,) standard deviation of the noise of each channel.
-    """
+def _summarise_errors(errors: _ScoredRuns) -> dict[str, Any]:
+    """Summarise the RMS error of each channel, and that of all in units of the noise."""
+    evaluator, squares, sigma = errors
     observed_mask = np.isfinite(evaluator.observed)
     counts = observed_mask.sum(axis=(0, 1))
     rmse = {}
