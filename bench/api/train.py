@@ -24,7 +24,7 @@ from bench.benchmark.runner.trained_weights import TrainingResult, get_weights_f
 from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.core.plugin_registries import simulators, tuners
-from bench.figures.loss_figure import write_loss_figure
+from bench.figures.loss_figure import LossRow, write_loss_figure
 from methods.learning.training_data import TrainingBudgetTooSmallError
 from methods.tuner import TrainingCallback, TrainingSimulator
 from sims.core import files
@@ -174,7 +174,7 @@ class LossRecorder:
 
     experiment: Experiment
     start: ProgressFactory
-    rows: list[tuple[int, str, int, float, float]] = field(default_factory=list)
+    rows: list[LossRow] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.start_training("", 0)
@@ -201,7 +201,7 @@ class LossRecorder:
         if stage != self._stage:
             self._stage = stage
             self._step = self.start(f"{self._title}, {stage}", epochs)
-        self.rows.append((self._seed, stage, epoch, loss, held_out))
+        self.rows.append(LossRow(self._seed, stage, epoch, loss, held_out))
         self._step()
 
     def write(self, folder: Path, title: str) -> list[Path]:

@@ -16,7 +16,7 @@ from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_sampling import ShotSetup, get_stream_prefix
 from bench.bounce_shot.true_world import GRAVITY, InclinedGround, simulate_shot
 from bench.core.random_streams import make_rng
-from bench.figures.recording_figure import render_track_figure
+from bench.figures.ball_track_figure import render_track_figure
 from bench.logs import film_tracking
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run

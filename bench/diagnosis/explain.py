@@ -187,7 +187,7 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
         InputError: The conventions of the recording contradict the model file, or no fit of the
             base model can simulate the recording.
     """
-    # These remember what they find: wrong units, and numerical settings that differ from the file.
+    # They store what they find: wrong units, and numerical settings that differ from the file.
     error_check = RecordingErrorCheck()
     step_choice, option_choice = TimeStepChoice(), SolverOptionChoice()
     # 1. Conventions.

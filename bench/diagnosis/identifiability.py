@@ -20,24 +20,37 @@ White noise is assumed, and the derivatives are those of the model that fits the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
+from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
+from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.base_fit import BaseFit
+from bench.diagnosis.fitting.base_fit import BaseFit, fit_base_model
 from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.search.diagnose import find_unidentified_parameters
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.validation.confidence_intervals import Z95, invert_scaled
+from bench.diagnosis.validation.confidence_intervals import (
+    Z95,
+    compute_central_jacobian,
+    invert_scaled,
+)
+from bench.logs.filter_settling import leave_out_settling
+from bench.logs.recording_loading import load_recording
+from bench.logs.segmentation import segment_recording
 from sims.core.effect import ALL_PLACES
 from sims.core.plain_values import format_unit, join_first_names
-from sims.core.simulator import Array, Parameter
+from sims.core.simulator import Array, InputError, Parameter
+from sims.recording.recording import Recording
+from sims.system_simulator import SystemSimulator
 
 IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
 
@@ -464,3 +477,52 @@ def freeze_unidentified_parameters(
             base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_indices)
         ).refit_at_nominal(evaluator, noise, frozen_indices)
     return base
+
+
+def check_identifiability(
+    source: str | Path | Recording,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+) -> tuple[ParameterIdentifiability, ...]:
+    """Assess which free numbers and which causes a recording can identify.
+
+    The base model is fitted first. The derivatives of the runs at the fit then show what the
+    recording can determine; white noise is assumed, so no correlation is estimated.
+
+    Args:
+        source: Recording, or the path of its table.
+        system: Name of the system to use instead of the one in the description.
+        model: Model file of a robot to use instead of the one in the description.
+        free: Numbers of a robot's model file, or constants of a system, that are estimated.
+
+    Returns:
+        Identifiability of each free number, then of each cause.
+
+    Raises:
+        InputError: The recording cannot be read, or its simulator takes no effects.
+    """
+    recording, kind = load_recording(source, system, model, free)
+    if not issubclass(kind, SystemSimulator):
+        raise InputError(f"{recording.path}: simulator {recording.system} takes no effects")
+    recording, _ = leave_out_settling(recording, kind)
+    recording, _ = segment_recording(recording, kind)
+    engine = kind.default_engine if kind.own_engine else "batch"
+    constants = () if kind.has_model else tuple(free)
+    with closing(ForkedWorkerPool(1)) as worker_pool:
+        evaluator = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
+        evaluator.worker_pool = worker_pool
+        worker_pool.register(evaluator)
+        noise = NoiseModel.make_white(compute_noise_floor(evaluator, recording).sigma)
+        base = fit_base_model(evaluator, noise)
+        if not np.isfinite(base.fit.cost):
+            raise InputError(
+                f"{recording.path}: the simulation fails at every starting point of the fit; "
+                "check constants, units, inputs and initial states"
+            )
+        # Derivatives of the runs at the fit.
+        numbers = assess_identifiability(
+            evaluator, noise, compute_central_jacobian(evaluator, base.fit, noise)
+        )
+        evaluator.close()
+    return numbers

@@ -16,7 +16,7 @@ from bench.diagnosis import many_logs
 from bench.diagnosis.many_logs import LOGS_TABLE_FILE, LogResult
 from bench.diagnosis.report import effect_and_unit_text
 from bench.figures import figure_output, style
-from bench.figures.style import break_name
+from bench.figures.label_text import break_name
 from bench.pages.chart import Axis, Panel, ReferenceLine, Series
 from bench.pages.chart_figure import draw_chart, finish_chart
 from bench.pages.html_page import HtmlPage

@@ -12,11 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bench.diagnosis.extended_robot_files import make_option_value
-from bench.diagnosis.search.verdict_rules import (
-    VerdictName,
-    improves_held_out,
-    is_indistinguishable,
-)
+from bench.diagnosis.search.verdict_rules import VerdictName
 from bench.diagnosis.verdict import Cause, Verdict
 from sims.extended_simulator import FittedValue
 
@@ -24,14 +20,6 @@ if TYPE_CHECKING:
     from bench.diagnosis.evaluation.discretisation_error import StepRefinement
     from sims.robot.robot_simulator import RobotSimulator
 
-MIN_FINER_STEP_GAIN = 20.0
-"""Minimum gain in twice the log-likelihood of a finer step over the file's own step; it means odds
-of 22,000 to 1.
-"""
-MIN_CLOSED_SHARE = 0.5
-"""Minimum share of the base model's gap that a finer step must close alone to be used in the
-search. With a smaller share, another missing effect decides which step looks better.
-"""
 STEP, INTEGRATOR = "numerics.step", "numerics.integrator"
 _VERDICT_WITH_NUMERICS: dict[VerdictName, VerdictName] = {
     "adequate": "named",
@@ -43,34 +31,6 @@ MAX_P_VALUE_GAIN = 1400.0
 
 Beyond it, exp(-gain / 2) becomes zero by underflow.
 """
-
-
-def is_finer_step_better(gain: float, gap: float, remaining_gap: float) -> bool:
-    """Return whether a finer step is significantly better and alone closes a large part of the gap.
-
-    Args:
-        gain: Gain in twice the log-likelihood of the base model.
-        gap: Excess RMS residual of the base model with the file's own step, in units of the noise.
-        remaining_gap: Excess RMS residual of the base model with the finer step, in units of the
-            noise.
-    """
-    return gain >= MIN_FINER_STEP_GAIN and gap - max(remaining_gap, 0.0) >= MIN_CLOSED_SHARE * gap
-
-
-def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float]) -> bool:
-    """Return whether a model with a finer step is significantly better than one with the file's.
-
-    Args:
-        file: Penalised log-likelihood (twice the log-likelihood less log n for each parameter;
-            Schwarz's criterion) and excess RMS residual in units of the noise, with the file's
-            step.
-        finer: The two values with the finer step. Far from the noise floor, autocorrelated
-            residuals bias the likelihood, so the residual must be smaller too.
-    """
-    (file_merit, file_excess), (finer_merit, finer_excess) = file, finer
-    return not is_indistinguishable(finer_merit - file_merit) and improves_held_out(
-        (file_merit, finer_merit), (file_excess, finer_excess)
-    )
 
 
 class CoarseStepFinding(NamedTuple):

@@ -6,7 +6,7 @@ its resulting value in the model file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -216,8 +216,8 @@ class _Totals:
         """Return a number of the model file as stated and with a changed coefficient, and its unit.
 
         The second value has all other effects applied. The ends of an interval of a coefficient are
-        converted to those of the number in this way. If the file has no such number, the result is
-        None and the coefficient itself.
+        converted to those of the number in this way. If the file has no such number, there is no
+        first value (None), and the second one is the coefficient itself.
 
         Args:
             cause_index: Index of the cause.
@@ -328,3 +328,22 @@ def describe_ranges(
             f"{quantity} of {place_text}: {value_in_file}{number_range.value:.4g} "
             f"({number_range.low:.4g} to {number_range.high:.4g}){unit} with {number_range.cause}",
         )
+
+
+def list_heading(extended: ExtendedSimulator, framework: str, left_out: Iterable[str]) -> list[str]:
+    """List the comments at the beginning of a file: its origin, and ranges that are left out.
+
+    Args:
+        extended: Extended simulator with the numbers.
+        framework: Name of the framework.
+        left_out: Reasons for ranges that are left out.
+    """
+    model = extended.robot.path.name if extended.robot is not None else extended.system
+    return [
+        f"Domain randomisation for {framework}, written by simgap explain --ranges: robot "
+        f"{model}, recording {extended.title}.",
+        "Each range is the 95 % interval of a number of the model file with the causes found. "
+        "It states how well this recording determines the number, not how robots of one type "
+        "differ.",
+        *(f"Left out: {line}." for line in left_out),
+    ]

@@ -163,7 +163,8 @@ def compute_speeds(evaluator: RunEvaluator, simulated: Array) -> Array | None:
     ]
     if not velocities:
         return None
-    return np.sqrt(np.nan_to_num(np.square(velocities).sum(axis=0)))
+    speeds: Array = np.sqrt(np.nan_to_num(np.square(velocities).sum(axis=0)))
+    return speeds
 
 
 def _compute_slopes(evaluator: RunEvaluator, simulated: Array, channel: str) -> Array:

@@ -54,6 +54,9 @@ def score_model(
         InputError: A file cannot be read, or the recording is of another system.
     """
     path = recording.path if isinstance(recording, Recording) else Path(recording)
+    # Checked before the description is read, which may name the system of the same plugin.
+    if model.suffix not in MODEL_FILES:
+        _check_plugin(model)
     # The description names the system of the recording before the table is read.
     model_reference = (
         recording.model if isinstance(recording, Recording) else read_model_reference(path)
@@ -61,7 +64,6 @@ def score_model(
     if model.suffix in MODEL_FILES:
         extended, kind = _load_robot(model, model_reference)
     else:
-        _check_plugin(model)
         extended, kind, _ = open_extended(model, simulators.get)
         # A recording of another robot is recognised by its channels.
         if model_reference is None or extended.robot is None:

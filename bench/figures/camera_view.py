@@ -91,7 +91,9 @@ def _compute_camera_axes(azimuth: float, elevation: float) -> Array:
 
 
 def make_posed_data(robot: RobotModel, positions: dict[str, float]) -> Any:
-    """Compute the robot's mujoco.MjData at a pose.
+    """Compute the robot's mujoco.MjData at a pose: positions of bodies and joints in the world.
+
+    Joints with several coordinates keep the pose of the model file.
 
     Args:
         robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -104,9 +106,10 @@ def make_posed_data(robot: RobotModel, positions: dict[str, float]) -> Any:
         if joint.has_one_coordinate and joint.name in positions:
             data.qpos[joint.position] = positions[joint.name]
     mujoco.mj_forward(robot.compiled, data)
-    for joint in (j for j in robot.joints if j.name in robot.base_joints):
+    for joint in robot.joints:
         # The slides of a floating body have no bearings: they are where the body is.
-        data.xanchor[joint.id] = data.xpos[robot.compiled.jnt_bodyid[joint.id]]
+        if joint.name in robot.base_joints:
+            data.xanchor[joint.id] = data.xpos[robot.compiled.jnt_bodyid[joint.id]]
     return data
 
 
@@ -124,18 +127,16 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
     azimuth, elevation = _choose_view_angles(robot, data)
     axes = _compute_camera_axes(azimuth, elevation)
     moving_points, static_points = compute_bounding_points(robot.compiled, data)
-    points = (
-        np.concatenate(
-            [
-                data.xanchor,
-                moving_points,
-                _find_end_points(robot.compiled, data),
-                _find_actuated_sites(robot.compiled, data),
-            ]
-        )
-        @ axes.T
+    world_points = np.concatenate(
+        [
+            data.xanchor,
+            moving_points,
+            _find_end_points(robot.compiled, data),
+            _find_actuated_sites(robot.compiled, data),
+        ]
     )
     # Corners of the bounding box in m, along the camera's axes right, up and forward.
+    points = world_points @ axes.T
     low, high = points.min(axis=0), points.max(axis=0)
     if len(static_points):
         # A floor or a long rail would make the robot too small.
@@ -150,9 +151,10 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
 
 
 def _find_end_points(model: Any, data: Any) -> Array:
-    """Return the (N, 3) drawn ends of bodies that have neither shapes nor child bodies.
+    """Return the (N, 3) drawn ends of bodies that have a joint, but no shapes and no child bodies.
 
-    The end is the body's joint mirrored at its centre of mass.
+    Such a body is drawn as a line from its joint to its end: the joint mirrored at the centre of
+    mass.
 
     Args:
         model: compiled model (`mujoco.MjModel`).
@@ -184,7 +186,9 @@ def _find_actuated_sites(model: Any, data: Any) -> Array:
 def _choose_view_angles(robot: RobotModel, data: Any) -> tuple[float, float]:
     """Choose azimuth and elevation of the camera, in degrees.
 
-    A planar robot is viewed along its common axis; another one from where its joints look widest.
+    A planar robot is viewed along its common axis, from the side on which x points to the right,
+    as in a drawing. Another robot is viewed from slightly above, in the direction of
+    `CANDIDATE_AZIMUTHS_DEG` from which its joints look widest.
 
     Args:
         robot: model of the robot.
@@ -196,16 +200,19 @@ def _choose_view_angles(robot: RobotModel, data: Any) -> tuple[float, float]:
     if normal is not None:
         azimuth = float(np.rad2deg(np.arctan2(normal[1], normal[0]))) % 360
         elevation = float(np.rad2deg(np.arcsin(np.clip(normal[2], -1, 1))))
-        # Of the two sides, use the one where x points to the right, as in a drawing.
-        right = _compute_camera_axes(azimuth, elevation)[0]
+        right, _, _ = _compute_camera_axes(azimuth, elevation)
         # The small second component decides if the first one is zero.
-        flipped = right @ (1.0, 1e-3, 0.0) < 0
-        return ((azimuth + 180) % 360, -elevation) if flipped else (azimuth, elevation)
+        if right @ (1.0, 1e-3, 0.0) < 0:
+            return (azimuth + 180) % 360, -elevation
+        return azimuth, elevation
     moving, _ = compute_bounding_points(robot.compiled, data)
     points = np.concatenate([data.xanchor, moving.mean(axis=0, keepdims=True)])
 
     def spread(azimuth: float) -> float:
-        """Return how widely the joints are spread in the picture from an azimuth, in m²."""
+        """Return how widely the joints are spread in the picture from an azimuth, in m².
+
+        It is the product of the singular values of their positions about the mean.
+        """
         projected = points @ _compute_camera_axes(azimuth, ELEVATION_DEG)[:2].T
         sizes = np.linalg.svd(projected - projected.mean(axis=0), compute_uv=False)
         return float(np.prod(sizes))
@@ -217,6 +224,9 @@ def _choose_view_angles(robot: RobotModel, data: Any) -> tuple[float, float]:
 
 def _find_motion_plane_normal(robot: RobotModel, data: Any) -> Array | None:
     """Return (3,) the normal of the plane in which a planar robot moves; None for others.
+
+    A robot is planar if all its hinges have parallel axes, and all slides are perpendicular to
+    them.
 
     Args:
         robot: model of the robot.
@@ -250,21 +260,23 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
 
     floor_types = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     corners = np.array(list(product((-1, 1), repeat=3)))
-    points_by_mobility: tuple[list[Array], list[Array]] = ([data.xipos[:0]], [data.xipos[:0]])
-    shaped = set()
+    # Points (n, 3) in the world, with the body they belong to.
+    points_with_body: list[tuple[int, Array]] = []
     for geom in range(model.ngeom):
-        if int(model.geom_type[geom]) in floor_types:
-            continue
-        body = int(model.geom_bodyid[geom])
-        shaped.add(body)
-        box = model.geom_aabb[geom, :3] + corners * model.geom_aabb[geom, 3:]
-        turn = data.geom_xmat[geom].reshape(3, 3)
-        points_by_mobility[_is_static_body(model, body)].append(data.geom_xpos[geom] + box @ turn.T)
+        if int(model.geom_type[geom]) not in floor_types:
+            # The bounding box has its centre and its half-lengths in the frame of the shape.
+            box = model.geom_aabb[geom, :3] + corners * model.geom_aabb[geom, 3:]
+            rotation = data.geom_xmat[geom].reshape(3, 3)
+            points = data.geom_xpos[geom] + box @ rotation.T
+            points_with_body.append((int(model.geom_bodyid[geom]), points))
+    shaped_bodies = {body for body, _ in points_with_body}
     for body in range(1, model.nbody):
-        if body not in shaped:
-            points_by_mobility[_is_static_body(model, body)].append(data.xipos[body][None])
-    moving_points, static_points = (np.concatenate(part) for part in points_by_mobility)
-    return moving_points, static_points
+        if body not in shaped_bodies:
+            points_with_body.append((body, data.xipos[body][None]))
+    moving, static = [data.xipos[:0]], [data.xipos[:0]]
+    for body, points in points_with_body:
+        (static if _is_static_body(model, body) else moving).append(points)
+    return np.concatenate(moving), np.concatenate(static)
 
 
 def _is_static_body(model: Any, body: int) -> bool:

@@ -116,7 +116,7 @@ def render_pdf(figure: Figure) -> bytes:
 
 
 def render_svg(figure: Figure) -> bytes:
-    """Render a figure as the bytes of an SVG file.
+    """Render a figure as the bytes of an SVG file, the same whenever it is made.
 
     Args:
         figure: Figure of Matplotlib.
@@ -127,11 +127,13 @@ def render_svg(figure: Figure) -> bytes:
     # Without a date and random names the file is identical whenever it is made.
     with rc_context({"svg.hashsalt": "simgap"}):
         figure.savefig(file, format="svg", metadata={"Date": None})
-    # A hundredth of a point is finer than any printer's resolution; longer numbers would double the
-    # size.
-    return _LONG_NUMBER_PATTERN.sub(
-        lambda match: f"{float(match[0]):.2f}".encode(), file.getvalue()
-    )
+
+    def shorten(number: re.Match[bytes]) -> bytes:
+        """Round to a hundredth of a point, which is finer than any printer's resolution."""
+        return f"{float(number[0]):.2f}".encode()
+
+    # Longer numbers would double the size of the file.
+    return _LONG_NUMBER_PATTERN.sub(shorten, file.getvalue())
 
 
 def render_png_and_pdf(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | None]:
@@ -190,17 +192,18 @@ def _lay_out_once(figure: Figure, dpi: int) -> Iterator[None]:
         figure: figure of Matplotlib.
         dpi: resolution for which text is measured, in pixels per inch.
     """
-    engine, screen = figure.get_layout_engine(), figure.dpi
+    engine, screen_dpi = figure.get_layout_engine(), figure.dpi
     try:
+        # Without an engine, the margins are set by hand.
         if engine is not None:
-            # savefig would draw the figure once more for the layout of each file.
             figure.set_dpi(dpi)
             engine.execute(figure)
-            figure.set_dpi(screen)
+            figure.set_dpi(screen_dpi)
+            # With the engine, savefig would draw the figure once more for the layout of each file.
             figure.set_layout_engine(None)
         yield
     finally:
-        figure.set_dpi(screen)
+        figure.set_dpi(screen_dpi)
         figure.set_layout_engine(engine)
 
 

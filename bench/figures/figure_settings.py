@@ -10,11 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass
-
 
 _WANTED: ContextVar[bool] = ContextVar("pdf_wanted", default=False)
 

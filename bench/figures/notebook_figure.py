@@ -14,25 +14,26 @@ from bench.figures.figure_settings import is_command
 
 @contextmanager
 def _skip_generated_documentation() -> Iterator[None]:
-    """Context that skips the documentation that Matplotlib generates if a command runs.
+    """Context that skips the documentation that Matplotlib generates when it is imported.
 
     The property tables in its docstrings and the signatures of the methods `set` take a quarter of
-    the import time. Nothing but documentation depends on them.
+    the import time. Nothing but documentation depends on them, so the functions that generate them
+    are replaced during the import. In an interactive session they are kept.
     """
     artist: Any = matplotlib.artist
+    # The second one is private: a later Matplotlib may not have it.
     generators = [(artist, "kwdoc"), (artist.Artist, "_update_set_signature_and_docstring")]
-    # The second is private: a later Matplotlib may not have it.
-    replaced = [
+    originals = [
         (owner, name, vars(owner)[name]) for owner, name in generators if name in vars(owner)
     ]
     if is_command():
-        for owner, name, _ in replaced:
+        for owner, name, _ in originals:
             setattr(owner, name, _return_no_text)
     try:
         yield
     finally:
-        for owner, name, generator in replaced:
-            setattr(owner, name, generator)
+        for owner, name, original in originals:
+            setattr(owner, name, original)
 
 
 def _return_no_text(*_: object) -> str:

@@ -42,13 +42,17 @@ def list_gl_backends() -> tuple[str, ...]:
     chosen_backend = os.environ.get("MUJOCO_GL", "").lower()
     if chosen_backend in ("disable", "disabled", "off", "false", "0"):
         return ()
-    # On other platforms MuJoCo's default needs no window.
-    usual = ("egl", "osmesa") if sys.platform.startswith("linux") else ("",)
-    return (chosen_backend, *usual) if chosen_backend in ("egl", "osmesa") else usual
+    # On other platforms MuJoCo's default, the empty name, needs no window.
+    usual_backends = ("egl", "osmesa") if sys.platform.startswith("linux") else ("",)
+    if chosen_backend in ("egl", "osmesa"):
+        return (chosen_backend, *usual_backends)
+    return usual_backends
 
 
 def render_robot(model: Any, positions: Array, view: Projection) -> Image | None:
-    """Render the robot in grey on white.
+    """Render the robot in grey on white, with the first OpenGL backend that works.
+
+    A backend that fails is not tried again in this process.
 
     Args:
         model: mujoco.MjModel.
@@ -135,7 +139,7 @@ def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image
         data: its state at the pose.
         view: camera.
     """
-    scale = MAX_IMAGE_PIXELS / max(view.width, view.height)
+    scale = MAX_IMAGE_PIXELS / max(view.width, view.height)  # Pixels per metre.
     pixel_height, pixel_width = (max(2, round(scale * size)) for size in (view.height, view.width))
     global_options = model.vis.global_
     global_options.offwidth, global_options.offheight = pixel_width, pixel_height
@@ -157,29 +161,32 @@ def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image
     with mujoco.Renderer(model, pixel_height, pixel_width) as renderer:
         renderer.update_scene(data, camera)
         colours = renderer.render().astype(np.float64)
+        # The segmentation has the number of the object in each pixel, and -1 for none.
         renderer.enable_segmentation_rendering()
         renderer.update_scene(data, camera)
-        shape = renderer.render()[:, :, 0] >= 0
-    return convert_to_grey(colours, shape)
+        is_robot = renderer.render()[:, :, 0] >= 0
+    return convert_to_grey(colours, is_robot)
 
 
-def convert_to_grey(colours: Array, shape: NDArray[np.bool_]) -> Image:
+def convert_to_grey(colours: Array, is_robot: NDArray[np.bool_]) -> Image:
     """Convert an image to light greys on white, so that marks are clearly visible.
+
+    The robot's own range of brightness is mapped to greys from 120 to 232; outside of it the image
+    is white.
 
     Args:
         colours: (H, W, 3) colours from 0 to 255.
-        shape: (H, W) mask of the robot.
+        is_robot: (H, W) mask of the robot.
 
     Returns:
         (H, W, 3) grey image.
     """
     # Luma of ITU-R BT.601.
     luma = colours @ (0.299, 0.587, 0.114)
-    robot_luma = luma[shape]
+    robot_luma = luma[is_robot]
     low, high = np.quantile(robot_luma, LUMA_QUANTILES) if robot_luma.size else (0.0, 1.0)
-    # The robot's own range of luma is mapped to medium to light grey.
     share = np.clip((luma - low) / max(high - low, 1.0), 0.0, 1.0)
-    grey = np.where(shape, 120 + 112 * share, 255)
+    grey = np.where(is_robot, 120 + 112 * share, 255)
     return np.repeat(grey.round().astype(np.uint8)[:, :, None], 3, axis=2)
 
 

@@ -14,15 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.figures.camera_view import Projection, choose_projection, make_posed_data
+from bench.figures.label_text import break_name
 from bench.figures.offscreen_rendering import render_robot
-from bench.figures.style import (
-    BLUE,
-    CAPTION_GREY,
-    NEUTRAL_MARK,
-    NULL_LEVEL_GREY,
-    break_name,
-    make_panel_grid,
-)
+from bench.figures.style import BLUE, CAPTION_GREY, NEUTRAL_MARK, NULL_LEVEL_GREY, make_panel_grid
 from sims.core.simulator import Array, InputError
 
 if TYPE_CHECKING:
@@ -65,29 +59,26 @@ def draw_skeleton(axis: Axes, robot: RobotModel, data: Any, view: Projection) ->
 
 
 def compute_link_segments(robot: RobotModel, data: Any) -> list[tuple[Array, Array]]:
-    """Compute the end points (3,) of each link.
+    """Compute the end points (3,) of each link in the world, in m.
 
-    A link extends from the joint of the parent body to the body's own joint, or from the last joint
-    to the end of the last body.
+    A link extends from the joint of a moving body to that of each child body. The link of a body
+    without child bodies extends to the end of the body. Static bodies have no links.
 
     Args:
         robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         data: MuJoCo data at the pose.
     """
     model = robot.compiled
-    segments = []
-    parents = set()
-    for body in range(1, model.nbody):
-        if not int(model.body_weldid[body]):
-            continue
-        parent = int(model.body_parentid[body])
-        parents.add(parent)
-        if parent:
-            segments.append(
-                (_find_link_start(model, data, parent), _find_link_start(model, data, body))
-            )
-    for body in range(1, model.nbody):
-        if int(model.body_weldid[body]) and body not in parents:
+    # A body that is welded to the world, body 0, is static.
+    moving_bodies = [body for body in range(1, model.nbody) if int(model.body_weldid[body])]
+    parents = [int(model.body_parentid[body]) for body in moving_bodies]
+    segments = [
+        (_find_link_start(model, data, parent), _find_link_start(model, data, body))
+        for body, parent in zip(moving_bodies, parents, strict=True)
+        if parent
+    ]
+    for body in moving_bodies:
+        if body not in parents:
             start = _find_link_start(model, data, body)
             segments.append((start, _find_link_end(model, data, body, start)))
     return segments
@@ -108,8 +99,8 @@ def _find_link_start(model: Any, data: Any, body: int) -> Array:
 def _find_link_end(model: Any, data: Any, body: int, start: Array) -> Array:
     """Return (3,) the end of a body without child bodies.
 
-    It is the point of its shapes that is furthest from the joint; without shapes, the joint
-    mirrored at the centre of mass.
+    It is the middle of a face of its shapes' bounding boxes, the one furthest from the joint;
+    without shapes, it is the joint mirrored at the centre of mass.
 
     Args:
         model: compiled model (`mujoco.MjModel`).
@@ -117,16 +108,23 @@ def _find_link_end(model: Any, data: Any, body: int, start: Array) -> Array:
         body: number of the body.
         start: (3,) anchor of its first joint, m.
     """
-    points = [2 * data.xipos[body] - start]
+    # Middles of the faces of the bounding boxes of its shapes.
+    face_points: list[Array] = []
     for geom in range(model.ngeom):
         if int(model.geom_bodyid[geom]) != body:
             continue
-        turn = data.geom_xmat[geom].reshape(3, 3)
-        middle = data.geom_xpos[geom] + turn @ model.geom_aabb[geom, :3]
-        half_extents = turn * model.geom_aabb[geom, 3:]
-        points += [*(middle + half_extents.T), *(middle - half_extents.T)]
-    shapes = points[1:] or points
-    return np.array(max(shapes, key=lambda p: round(float(np.linalg.norm(p - start)), 9)))
+        rotation = data.geom_xmat[geom].reshape(3, 3)
+        middle = data.geom_xpos[geom] + rotation @ model.geom_aabb[geom, :3]
+        half_extents = rotation * model.geom_aabb[geom, 3:]
+        face_points += [*(middle + half_extents.T), *(middle - half_extents.T)]
+    if not face_points:
+        return np.array(2 * data.xipos[body] - start)
+
+    def distance(point: Array) -> float:
+        # Without rounding, numerical errors would decide between equally distant points.
+        return round(float(np.linalg.norm(point - start)), 9)
+
+    return np.array(max(face_points, key=distance))
 
 
 def _find_base_points(robot: RobotModel, data: Any) -> list[Array]:
@@ -143,8 +141,10 @@ def _find_base_points(robot: RobotModel, data: Any) -> list[Array]:
     points = []
     for body in range(1, model.nbody):
         parent = int(model.body_parentid[body])
-        has_fixed_parent = not int(model.body_weldid[parent])
-        if int(model.body_weldid[body]) and has_fixed_parent and body not in free_bodies:
+        # A body that is welded to the world, body 0, is static.
+        is_moving, has_static_parent = model.body_weldid[body] != 0, model.body_weldid[parent] == 0
+        if is_moving and has_static_parent and body not in free_bodies:
+            # The origin of the world may be far away, so the body's own joint is used for it.
             points.append(
                 np.array(data.xpos[parent]) if parent else _find_link_start(model, data, body)
             )
@@ -266,7 +266,8 @@ def draw_robot_figure(
     """Draw the robot at a pose, with places marked.
 
     The robot is rendered if it has shapes, otherwise drawn as a skeleton. Labels of joints and
-    marked places are in two columns at its sides, with a scale bar below.
+    marked places are in two columns at its sides, with a scale bar below. The axes are in metres,
+    the layout is in inches.
 
     Args:
         robot: Robot to draw.
@@ -277,20 +278,26 @@ def draw_robot_figure(
     projection = choose_projection(robot, data)
     labels = _make_labels(robot, data, projection, marks)
     left_labels, right_labels = _divide_labels(labels)
-    # Sizes in inches; coordinates of the axes are metres.
+    # Scale of the picture in inches per metre; all other sizes are in inches.
     scale = MAX_SIDE_INCHES / max(projection.width, projection.height)
     width, height = scale * projection.width, scale * projection.height
-    left_width, right_width = (
-        _compute_column_width(left_labels),
-        _compute_column_width(right_labels),
-    )
+    left_width, right_width = map(_compute_column_width, (left_labels, right_labels))
     tall = max(height, _compute_column_height(left_labels), _compute_column_height(right_labels))
+    figure_width = left_width + width + right_width
     # 0.15 inches are the space above the scale bar.
-    size = (left_width + width + right_width, tall + SCALE_BAR_HEIGHT_INCHES + 0.15)
-    figure, axes = make_panel_grid(1, 1, size, layout=None)
+    figure_height = tall + SCALE_BAR_HEIGHT_INCHES + 0.15
+    figure, axes = make_panel_grid(1, 1, (figure_width, figure_height), layout=None)
     axis = axes[0, 0]
-    bottom_margin = (SCALE_BAR_HEIGHT_INCHES + (tall - height) / 2) / size[1]
-    axis.set_position((left_width / size[0], bottom_margin, width / size[0], height / size[1]))
+    # Left, bottom, width and height as shares of the figure; the picture is centred vertically.
+    bottom = SCALE_BAR_HEIGHT_INCHES + (tall - height) / 2
+    axis.set_position(
+        (
+            left_width / figure_width,
+            bottom / figure_height,
+            width / figure_width,
+            height / figure_height,
+        )
+    )
     axis.set_axis_off()
     half_width, half_height = projection.width / 2, projection.height / 2
     axis.set(xlim=(-half_width, half_width), ylim=(-half_height, half_height))
@@ -306,7 +313,9 @@ def draw_robot_figure(
 
 
 def _draw_robot(axis: Axes, robot: RobotModel, data: Any, projection: Projection) -> None:
-    """Draw the rendered robot with thin lines along its links, or its skeleton without shapes.
+    """Draw the rendered robot with thin lines along its links, or else its skeleton.
+
+    The skeleton is drawn if the robot has no shapes, or this machine cannot render it.
 
     Args:
         axis: axes to draw on, in metres.
@@ -314,9 +323,9 @@ def _draw_robot(axis: Axes, robot: RobotModel, data: Any, projection: Projection
         data: state at the pose (`mujoco.MjData`).
         projection: camera.
     """
-    image = (
-        render_robot(robot.compiled, data.qpos.copy(), projection) if _has_shapes(robot) else None
-    )
+    image = None
+    if _has_shapes(robot):
+        image = render_robot(robot.compiled, data.qpos.copy(), projection)
     if image is None:
         draw_skeleton(axis, robot, data, projection)
         return
@@ -331,14 +340,14 @@ def _draw_robot(axis: Axes, robot: RobotModel, data: Any, projection: Projection
     for segment in compute_link_segments(robot, data):
         line = projection.project(np.stack(segment))
         axis.plot(*line.T, color=CAPTION_GREY, linewidth=0.7, zorder=3)
-    dots = projection.project(np.array([data.xanchor[j.id] for j in robot.joints]))
+    dots = projection.project(np.array([data.xanchor[joint.id] for joint in robot.joints]))
     axis.plot(*dots.T, "o", color=NEUTRAL_MARK, markersize=3.5, zorder=4)
 
 
 def compute_joint_positions(
     figure: Figure, robot: RobotModel, positions: Mapping[str, float]
 ) -> list[tuple[str, float, float]]:
-    """Compute the positions of the joints in a figure of the robot.
+    """Compute the positions of the joints in a figure of the robot, to highlight them on a page.
 
     Args:
         figure: Figure made by `draw_robot_figure`.
@@ -371,7 +380,8 @@ def _make_labels(
 ) -> list[_Label]:
     """Make a label for each marked place, and for the other joints if the robot has few.
 
-    Several marks of one place share a label, with a line for each.
+    Several marks of one place share a label, with a line for each. A mark at a place that the
+    robot does not have is left out.
 
     Args:
         robot: model of the robot.
@@ -408,20 +418,26 @@ def _make_labels(
 def _divide_labels(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:
     """Divide labels between the left and the right column, each from top to bottom.
 
-    Each label is on the side of its place, as long as there is space.
+    Each label is on the side of its place in the picture. But a column is not longer than the
+    drawing, unless both columns are: then labels near the middle move to the other side.
     """
-    ordered_labels = sorted(labels, key=lambda label: (label.point[0], -label.point[1]))
-    count = sum(label.point[0] < 0 for label in ordered_labels)
-    # A column is not longer than the drawing, unless both columns are.
-    while count and _compute_column_height(ordered_labels[:count]) > max(
-        MAX_SIDE_INCHES, _compute_column_height(ordered_labels[count:])
-    ):
-        count -= 1
-    while count < len(ordered_labels) and _compute_column_height(ordered_labels[count:]) > max(
-        MAX_SIDE_INCHES, _compute_column_height(ordered_labels[:count])
-    ):
-        count += 1
-    return _sort_downwards(ordered_labels[:count]), _sort_downwards(ordered_labels[count:])
+
+    def get_x(label: _Label) -> tuple[float, float]:
+        """Return a sort key from left to right, and from top to bottom."""
+        x, y = label.point.tolist()
+        return x, -y
+
+    def is_too_long(column: Sequence[_Label], other: Sequence[_Label]) -> bool:
+        return _compute_column_height(column) > max(MAX_SIDE_INCHES, _compute_column_height(other))
+
+    right = sorted(labels, key=get_x)
+    left = [label for label in right if label.point[0] < 0]
+    right = right[len(left) :]
+    while is_too_long(left, right):
+        right.insert(0, left.pop())
+    while is_too_long(right, left):
+        left.append(right.pop(0))
+    return _sort_downwards(left), _sort_downwards(right)
 
 
 def _compute_column_height(labels: Sequence[_Label]) -> float:
@@ -446,7 +462,8 @@ def arrange_labels(
 ) -> Array:
     """Compute (N,) middles of labels that do not overlap, close to the wanted ones.
 
-    One pass in each direction moves the labels apart.
+    A pass from the top moves each label down until it is below the previous one. A pass from the
+    bottom then moves those up that left the column.
 
     Args:
         wanted_positions: (N,) wanted middles, from top to bottom.
@@ -543,7 +560,7 @@ def _draw_scale_bar(axis: Axes, projection: Projection, scale: float, tall: floa
         scale: inches per metre.
         tall: height of the drawing in inches.
     """
-    # The bar is at most 0.3 of the picture's width.
+    # In metres; the bar is at most 0.3 of the picture's width, and 0.2 inches below it.
     length = round_down_length(0.3 * projection.width)
     left_edge = -projection.width / 2
     y = -tall / scale / 2 - 0.2 / scale
@@ -624,15 +641,19 @@ def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
     """
     import mujoco
 
-    kind, _, place_name = name.partition(".")
-    if kind != "s":
+    quantity, _, place_name = name.partition(".")
+    if quantity != "s":
         return locate_place(robot, data, "joint", place_name)
-    model = robot.compiled
-    row = next((s for s in robot.sensors if s.name == place_name), None)
-    if row is None:
+    sensor = next((sensor for sensor in robot.sensors if sensor.name == place_name), None)
+    if sensor is None:
         return None
-    sensor = int(np.searchsorted(model.sensor_adr, row.address, side="right")) - 1
-    object_id, object_type = int(model.sensor_objid[sensor]), int(model.sensor_objtype[sensor])
+    model = robot.compiled
+    # MuJoCo's sensor whose data contain this address; the name may be that of one component.
+    sensor_id = int(np.searchsorted(model.sensor_adr, sensor.address, side="right")) - 1
+    object_id, object_type = (
+        int(model.sensor_objid[sensor_id]),
+        int(model.sensor_objtype[sensor_id]),
+    )
     positions_by_type = {
         int(mujoco.mjtObj.mjOBJ_SITE): data.site_xpos,
         int(mujoco.mjtObj.mjOBJ_JOINT): data.xanchor,

@@ -22,6 +22,7 @@ def thin_signal(values: Array, max_samples: int) -> NDArray[np.intp]:
     """
     if values.size <= max_samples:
         return np.arange(values.size)
+    # Each part has two extremes, and the first and the last sample are kept.
     return select_extreme_samples([values], max_samples // 2 - 1)
 
 
@@ -38,17 +39,17 @@ def select_extreme_samples(signals: Sequence[Array], part_count: int) -> NDArray
         Sorted indices of the samples.
     """
     size = len(signals[0])
-    edges = np.linspace(0, size, part_count + 1).astype(int)[:-1]
-    part_length = np.diff([*edges, size]).max()
-    # Each row holds one part; shorter parts are padded with values that are never extremes.
-    indices = np.minimum(edges[:, None] + np.arange(part_length), size - 1)
-    is_inside = indices < np.append(edges[1:], size)[:, None]
-    rows = np.arange(len(edges))
+    edges = np.linspace(0, size, part_count + 1).astype(int)
+    begins, ends = edges[:-1], edges[1:]
+    # Each row has the samples of one part; shorter parts are padded with samples that are never
+    # extremes.
+    indices = np.minimum(begins[:, None] + np.arange((ends - begins).max()), size - 1)
+    is_inside = indices < ends[:, None]
+    parts = np.arange(part_count)
     selected_samples = [np.array([0, size - 1])]
     for signal in signals:
-        for sign in (1.0, -1.0):
-            values = np.where(
-                is_inside & np.isfinite(signal[indices]), sign * signal[indices], -np.inf
-            )
-            selected_samples.append(indices[rows, values.argmax(axis=1)])
+        for sign in (1.0, -1.0):  # Maximum and minimum.
+            is_candidate = is_inside & np.isfinite(signal[indices])
+            values = np.where(is_candidate, sign * signal[indices], -np.inf)
+            selected_samples.append(indices[parts, values.argmax(axis=1)])
     return np.unique(np.concatenate(selected_samples))

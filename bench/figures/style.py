@@ -7,7 +7,6 @@ settings and open figures are unchanged.
 
 from __future__ import annotations
 
-import re
 import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,72 +22,6 @@ if TYPE_CHECKING:
 
     from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.storage.reference_results import ReferenceResult
-
-
-POINTS = 72.0
-"""Number of points in an inch."""
-
-
-def break_name(name: str, longest: int) -> str:
-    """Break a name into lines of at most `longest` characters.
-
-    Lines end after underscores and similar characters if possible, and never within the brackets of
-    a unit.
-
-    Args:
-        name: Name to break.
-        longest: Maximum length of a line.
-    """
-    parts = []
-    for bracketed, free in re.findall(r"(\[[^\]]*\]\s*)|([^\[]+|\[)", name):
-        # Do not break after a decimal point.
-        parts += [bracketed] if bracketed else re.split(r"(?<=[_\-/ ])|(?<=\.)(?!\d)", free)
-    lines = [""]
-    for part in parts:
-        if lines[-1] and len(lines[-1]) + len(part.rstrip()) > longest:
-            lines.append("")
-        lines[-1] += part
-    # A part may be too long even for a line of its own.
-    return "\n".join(
-        wrapped_line for line in lines for wrapped_line in textwrap.wrap(line, longest)
-    )
-
-
-def shorten_name(name: str, max_length: int) -> str:
-    """Shorten a long name of a joint's quantity to the quantity.
-
-    Names with more than `max_length` characters are shortened, such as ``velocity of elbow`` to
-    ``velocity`` and ``u.elbow`` to ``u``.
-
-    Args:
-        name: Name to shorten.
-        max_length: Maximum length.
-    """
-    return (
-        name if len(name) <= max_length else re.split(r" of |\.", name, maxsplit=1)[0][:max_length]
-    )
-
-
-def measure_text_width(texts: Sequence[str], size: float, weight: str = "normal") -> float:
-    """Return the width of the longest line of some texts, in inches.
-
-    Args:
-        texts: Texts of one or several lines.
-        size: Size of the letters in points.
-        weight: ``normal`` or ``bold``.
-    """
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import text_to_path
-
-    font = FontProperties(family="DejaVu Sans", weight=weight, size=size)
-    lines = [line for text in texts for line in text.split("\n")]
-    widths = [text_to_path.get_text_width_height_descent(line, font, False)[0] for line in lines]
-    return float(max(widths, default=0.0)) / POINTS
-
-
-def count_max_lines(texts: Sequence[str]) -> int:
-    """Return the maximum number of lines of the texts."""
-    return max((text.count("\n") + 1 for text in texts), default=1)
 
 
 # Palette of eight colours safe for colour-blind readers: M. Okabe, K. Ito, Color Universal Design,
@@ -278,9 +211,12 @@ class TunerStyles:
             notes: Notes by tuner, which are added to its label.
         """
         self.experiment, self.references, self.notes = experiment, references, notes or {}
-        present = set(order)
         # Tuners without runs count, too, so that a colour means the same tuner in every figure.
-        self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
+        self._places = {
+            tuner.label: index
+            for index, tuner in enumerate(experiment.tuners)
+            if tuner.label in order
+        }
         self.order = [label for label in order if label in self._places]
 
     def get_mark_style(self, tuner: str) -> MarkStyle:
@@ -297,20 +233,18 @@ class TunerStyles:
             reference: The reference result.
             tuner: Label of the tuner.
         """
+        places = dict(self._places)
         # Tuners that the user does not have get the following indices.
-        further_tuners = [each for each in reference.tuners if each not in self._places]
-        first_free = 1 + max(self._places.values(), default=-1)
-        i = (
-            self._places[tuner]
-            if tuner in self._places
-            else first_free + further_tuners.index(tuner)
-        )
+        first_free = 1 + max(places.values(), default=-1)
+        further_tuners = [label for label in reference.tuners if label not in places]
+        places |= {label: first_free + i for i, label in enumerate(further_tuners)}
+        place = places[tuner]
         return {
             "color": REFERENCE_GREYS[self.references.index(reference)],
-            "marker": get_marker(i),
+            "marker": get_marker(place),
             "markerfacecolor": "white",
             "markersize": 3.5,
-            "linestyle": _LINES[i % len(_LINES)],
+            "linestyle": _LINES[place % len(_LINES)],
             "linewidth": 1.0,
             "zorder": 1.5,
         }
@@ -392,14 +326,15 @@ def finish_figure(
         caption: Caption below the figure.
         heading: Title of the legend.
     """
-    handles: dict[str, Any] = {}
+    handle_by_label: dict[str, Any] = {}
     # A panel may lack a tuner that another panel has; of several handles the first panel's is used.
     for axis in reversed(axes):
-        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+        handles, labels = axis.get_legend_handles_labels()
+        handle_by_label |= dict(zip(labels, handles, strict=True))
     legend_entries = [
-        (handles[label], "\n".join(filter(None, [label, style.notes.get(label)])))
+        (handle_by_label[label], "\n".join(filter(None, [label, style.notes.get(label)])))
         for label in style.order
-        if label in handles
+        if label in handle_by_label
     ]
     for reference in style.references:
         legend_entries += _make_reference_entries(axes, style, reference)
@@ -430,6 +365,9 @@ def _make_reference_entries(
     axes: list[Axes], style: TunerStyles, reference: ReferenceResult
 ) -> list[tuple[Line2D, str]]:
     """Make the legend entries of reference results: a heading, and each tuner that is drawn.
+
+    An entry is the handle and its label. The lines of references are recognised by their ids
+    (`make_reference_id`).
 
     Args:
         axes: all panels.

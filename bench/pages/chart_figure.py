@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bench.figures.label_text import break_name
 from bench.figures.style import (
     CAPTION_GREY,
     NOISE_BAND_GREY,
     add_caption,
-    break_name,
     make_panel_grid,
     set_title,
     style_axis,

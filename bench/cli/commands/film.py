@@ -98,7 +98,7 @@ def run_track(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
         options: Options of `simgap track`.
         print_line: Prints a line of text.
     """
-    from bench.figures.recording_figure import render_track_figure
+    from bench.figures.ball_track_figure import render_track_figure
     from bench.logs.film_tracking import track_film
 
     diameter, fps, scale = options.ball_diameter, options.fps, options.scale

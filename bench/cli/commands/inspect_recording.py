@@ -218,8 +218,7 @@ def _print_identifiability(
     The numbers are those that the user named with ``--free``, then the coefficients of the possible
     causes. The same is returned as JSON documents.
     """
-    from bench.diagnosis.identifiability import format_identifiability
-    from bench.diagnosis.recording_check import check_identifiability
+    from bench.diagnosis.identifiability import check_identifiability, format_identifiability
 
     free = parse_name_list(options.free or "")
     numbers = check_identifiability(options.recording, options.system, options.model, free)

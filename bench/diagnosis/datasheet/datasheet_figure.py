@@ -29,7 +29,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
 )
 from bench.figures import figure_output, style
 from bench.figures.figure_settings import is_pdf_wanted
-from bench.figures.style import POINTS, measure_text_width
+from bench.figures.label_text import POINTS, measure_text_width
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,15 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.numerics_cause import (
-    OptionFinding,
-    is_finer_model_better,
-    is_finer_step_better,
-)
+from bench.diagnosis.numerics_cause import OptionFinding
 from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.cause_search import CauseSearch
 from bench.diagnosis.pipeline.run_filtering import filter_runs
 from bench.diagnosis.pipeline.search_result import SearchResult
+from bench.diagnosis.pipeline.time_step_choice import is_finer_model_better, is_finer_step_better
 from bench.diagnosis.search.verdict_rules import is_indistinguishable
 
 MAX_LINEAR_RESIDUAL = 3.0

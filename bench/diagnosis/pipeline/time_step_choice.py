@@ -11,20 +11,25 @@ from typing import TYPE_CHECKING, Any
 from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.numerics_cause import (
-    CoarseStepFinding,
-    is_finer_model_better,
-    is_finer_step_better,
-)
+from bench.diagnosis.numerics_cause import CoarseStepFinding
 from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.cause_search import CauseSearch
 from bench.diagnosis.pipeline.run_filtering import filter_runs
 from bench.diagnosis.pipeline.search_result import SearchResult, rate_model
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
+from bench.diagnosis.search.verdict_rules import improves_held_out, is_indistinguishable
 
 if TYPE_CHECKING:
     from bench.diagnosis.evaluation.discretisation_error import StepRefinement
 
+MIN_FINER_STEP_GAIN = 20.0
+"""Minimum gain in twice the log-likelihood of a finer step over the file's own step; it means odds
+of 22,000 to 1.
+"""
+MIN_CLOSED_SHARE = 0.5
+"""Minimum share of the base model's gap that a finer step must close alone to be used in the
+search. With a smaller share, another missing effect decides which step looks better.
+"""
 MAX_SUBSET_EFFECTS = 3
 """Maximum number of effects of which all subsets are fitted with another time step."""
 REFIT_ITERATIONS = 8
@@ -197,3 +202,31 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
         key=lambda model: model.penalised_log_likelihood,
     )
     return rate_model(search, best)
+
+
+def is_finer_step_better(gain: float, gap: float, remaining_gap: float) -> bool:
+    """Return whether a finer step is significantly better and alone closes a large part of the gap.
+
+    Args:
+        gain: Gain in twice the log-likelihood of the base model.
+        gap: Excess RMS residual of the base model with the file's own step, in units of the noise.
+        remaining_gap: Excess RMS residual of the base model with the finer step, in units of the
+            noise.
+    """
+    return gain >= MIN_FINER_STEP_GAIN and gap - max(remaining_gap, 0.0) >= MIN_CLOSED_SHARE * gap
+
+
+def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float]) -> bool:
+    """Return whether a model with a finer step is significantly better than one with the file's.
+
+    Args:
+        file: Penalised log-likelihood (twice the log-likelihood less log n for each parameter;
+            Schwarz's criterion) and excess RMS residual in units of the noise, with the file's
+            step.
+        finer: The two values with the finer step. Far from the noise floor, autocorrelated
+            residuals bias the likelihood, so the residual must be smaller too.
+    """
+    (file_merit, file_excess), (finer_merit, finer_excess) = file, finer
+    return not is_indistinguishable(finer_merit - file_merit) and improves_held_out(
+        (file_merit, finer_merit), (file_excess, finer_excess)
+    )

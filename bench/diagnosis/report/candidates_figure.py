@@ -23,6 +23,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
 )
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from bench.diagnosis.verdict import Candidate
+from bench.figures.label_text import break_name, count_max_lines, measure_text_width
 from bench.figures.style import (
     BLUE,
     CAPTION_GREY,
@@ -30,10 +31,7 @@ from bench.figures.style import (
     NOISE_BAND_GREY,
     SKY_BLUE,
     ZERO_LINE_GREY,
-    break_name,
-    count_max_lines,
     make_panel_grid,
-    measure_text_width,
 )
 from sims.core.plain_values import format_count
 

@@ -49,7 +49,7 @@ from bench.diagnosis.report.report_data import (
 from bench.diagnosis.report.residual_figure import MAX_LABEL_LENGTH, select_informative_profiles
 from bench.diagnosis.validation.confidence_intervals import Z95
 from bench.figures.figure_output import FigureFiles
-from bench.figures.style import shorten_name
+from bench.figures.label_text import shorten_name
 from bench.pages.chart import Axis, Panel, Series
 from bench.pages.html_page import HtmlPage
 from bench.pages.interval_drawing import draw_intervals

@@ -21,6 +21,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.report.run_selection import RunView, format_selected_run, select_worst_run
+from bench.figures.label_text import POINTS, break_name, measure_text_width
 from bench.figures.signal_thinning import thin_signal
 from bench.figures.style import (
     BASE_MODEL_LINE,
@@ -29,11 +30,8 @@ from bench.figures.style import (
     EXTENDED_MODEL_LINE,
     NEUTRAL_MARK,
     NOISE_BAND_GREY,
-    POINTS,
     ZERO_LINE_GREY,
-    break_name,
     make_panel_grid,
-    measure_text_width,
 )
 from sims.core.root_mean_square import compute_rms
 

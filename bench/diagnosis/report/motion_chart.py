@@ -19,8 +19,9 @@ from bench.diagnosis.report.effect_and_unit_text import (
 from bench.diagnosis.report.joint_figure import is_robot, list_joint_rows
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.report.run_selection import RunView, rank_runs
+from bench.figures.label_text import shorten_name
 from bench.figures.signal_thinning import select_extreme_samples
-from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style, shorten_name
+from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style
 from bench.pages.chart import Axis, AxisSpan, Panel, Series, TooltipLine
 from bench.pages.page_table import Table
 from sims.core.simulator import Array

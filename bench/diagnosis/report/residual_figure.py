@@ -14,6 +14,7 @@ from bench.diagnosis.report.report_data import (
     GapLocation,
     ResidualProfile,
 )
+from bench.figures.label_text import break_name, count_max_lines, measure_text_width
 from bench.figures.style import (
     BASE_MODEL_LINE,
     BASE_MODEL_MARKER,
@@ -23,10 +24,7 @@ from bench.figures.style import (
     NEUTRAL_MARK,
     NULL_LEVEL_GREY,
     ZERO_LINE_GREY,
-    break_name,
-    count_max_lines,
     make_panel_grid,
-    measure_text_width,
 )
 
 if TYPE_CHECKING:

@@ -11,15 +11,15 @@ from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.explain import explain
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.numerics_cause import (
-    MIN_FINER_STEP_GAIN,
-    is_finer_model_better,
-    is_finer_step_better,
-)
 from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.recording_preparation import prepare_runs
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext
-from bench.diagnosis.pipeline.time_step_choice import TimeStepChoice
+from bench.diagnosis.pipeline.time_step_choice import (
+    MIN_FINER_STEP_GAIN,
+    TimeStepChoice,
+    is_finer_model_better,
+    is_finer_step_better,
+)
 from tests.bench.diagnosis.arm_model import ARM
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 

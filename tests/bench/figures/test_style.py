@@ -20,9 +20,10 @@ from bench.benchmark.comparison_figures import (
 from bench.benchmark.statistics.tuner_ranking import compute_nemenyi_p_values
 from bench.diagnosis.report import explanation_figures
 from bench.figures import figure_output, loss_figure, style
+from bench.figures.ball_track_figure import draw_track_figure
 from bench.figures.figure_output import render_all_formats, render_png, write_figure
 from bench.figures.figure_settings import pdf_figures
-from bench.figures.recording_figure import draw_recording_figure, draw_track_figure
+from bench.figures.recording_figure import draw_recording_figure
 from bench.figures.style import make_panel_grid
 from bench.logs.ball_heights import BallHeights
 from bench.logs.recording_loading import load_recording
@@ -53,7 +54,7 @@ def rank():
 
 def loss():
     return loss_figure.draw_loss_figure(
-        "t", [(0, "clean", e, 1.0 / e, 2.0 / e) for e in range(1, 9)]
+        "t", [loss_figure.LossRow(0, "clean", e, 1.0 / e, 2.0 / e) for e in range(1, 9)]
     )
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from bench.diagnosis.report.explanation_figures import draw_figure, list_figure_names
-from bench.figures.style import break_name, count_max_lines, measure_text_width, shorten_name
+from bench.figures.label_text import break_name, count_max_lines, measure_text_width, shorten_name
 from tests.bench.diagnosis.robot_report_data import cause, make_robot_report
 from tests.bench.diagnosis.sample_report_data import evil, make_report
 from tests.bench.figures.figure_readability import unreadable

@@ -7,8 +7,7 @@ import pytest
 
 from bench.diagnosis import identifiability
 from bench.diagnosis.explain import explain
-from bench.diagnosis.identifiability import format_identifiability
-from bench.diagnosis.recording_check import check_identifiability
+from bench.diagnosis.identifiability import check_identifiability, format_identifiability
 from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
