@@ -97,7 +97,11 @@ def explain_and_design(
         seconds: Duration in seconds of the next recording.
         longest: Maximum duration in seconds, if `seconds` do not suffice.
         options: Options of the explanation.
+
+    Returns:
+        The explanation, and the design; None if no run would add information.
     """
+    # The simulators stay open within the block.
     with _diagnose(recording, options) as diagnosis:
         diagnosis.result.runs.context.search_control.begin_stage("designing the next recording")
         design = _design_next_run(diagnosis.result, seconds, longest)

@@ -207,7 +207,7 @@ def _list_numerics_causes(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
 
 
 def make_option_value(effect: str, stated: float, number: float) -> FittedValue:
-    """Return the value of a changed option of the model file.
+    """Return the value of a changed option of the model file, which is chosen and has no interval.
 
     Args:
         effect: Effect that names the option, such as ``numerics.impratio``.

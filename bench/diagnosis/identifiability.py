@@ -508,6 +508,7 @@ def check_identifiability(
     recording, _ = leave_out_settling(recording, kind)
     recording, _ = segment_recording(recording, kind)
     engine = kind.default_engine if kind.own_engine else "batch"
+    # The freed numbers of a robot are parameters of `kind` already.
     constants = () if kind.has_model else tuple(free)
     with closing(ForkedWorkerPool(1)) as worker_pool:
         evaluator = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
@@ -520,9 +521,7 @@ def check_identifiability(
                 f"{recording.path}: the simulation fails at every starting point of the fit; "
                 "check constants, units, inputs and initial states"
             )
-        # Derivatives of the runs at the fit.
-        numbers = assess_identifiability(
-            evaluator, noise, compute_central_jacobian(evaluator, base.fit, noise)
-        )
+        fit_with_derivatives = compute_central_jacobian(evaluator, base.fit, noise)
+        numbers = assess_identifiability(evaluator, noise, fit_with_derivatives)
         evaluator.close()
     return numbers

@@ -82,7 +82,10 @@ def _compute_p_value(gain: float) -> float:
 
 
 def list_option_causes(finding: OptionFinding) -> list[Cause]:
-    """Return the options of the solver that differ from the model file as causes."""
+    """Return the options of the solver that differ from the model file as causes.
+
+    The coefficient of an option that is a word is its MuJoCo number.
+    """
     from sims.robot.integrator_settings import OPTION_EFFECTS, format_option, list_changed_options
 
     kind, p_value = finding.kind, _compute_p_value(finding.gain)

@@ -72,6 +72,7 @@ def compute_link_segments(robot: RobotModel, data: Any) -> list[tuple[Array, Arr
     # A body that is welded to the world, body 0, is static.
     moving_bodies = [body for body in range(1, model.nbody) if int(model.body_weldid[body])]
     parents = [int(model.body_parentid[body]) for body in moving_bodies]
+    # No link is drawn from the origin of the world.
     segments = [
         (_find_link_start(model, data, parent), _find_link_start(model, data, body))
         for body, parent in zip(moving_bodies, parents, strict=True)
@@ -497,14 +498,16 @@ def _draw_label_column(
         scale: inches per metre.
         tall: height of the column in inches.
     """
+    # Heights in metres of the picture.
     sizes = [label.height / scale for label in labels]
     half_height = tall / scale / 2
-    middles = arrange_labels([label.point[1] for label in labels], sizes, -half_height, half_height)
+    place_heights = [float(y) for _, y in (label.point for label in labels)]
+    middles = arrange_labels(place_heights, sizes, -half_height, half_height)
     for label, y in zip(labels, middles.tolist(), strict=True):
         colour = "black" if label.is_marked else CAPTION_GREY
         axis.annotate(
             "\n".join(label.lines),
-            (label.point[0], label.point[1]),
+            tuple(label.point),
             (x, y),
             ha="right" if x < 0 else "left",
             va="center",

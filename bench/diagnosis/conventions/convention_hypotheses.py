@@ -587,7 +587,7 @@ def _find_likely_column(recording: Recording, channel: str) -> str:
         column for table in tables if isinstance(table, dict) for column in _list_columns(table)
     ]
     channel_table = meta.get("channels", {}).get(channel, {})
-    position_column = (_list_columns(channel_table) or [channel])[0]
+    position_column, *_ = _list_columns(channel_table) or [channel]
     best, best_correlation = UNKNOWN_COLUMN, MIN_CORRELATION
     # The first log with the position decides.
     for log in _iterate_logs(description):

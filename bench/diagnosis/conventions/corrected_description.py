@@ -121,6 +121,7 @@ def _change_scale(
         table["scale"] = _round_value(factor * old_scale)
     if offset or old_offset:
         table["offset"] = _round_value(factor * old_offset + offset / unit_gain)
+    # The command that determines the turns of a wrapped angle, or only that they are missing.
     if change.unwrap:
         table["unwrap"] = change.command or True
     return table

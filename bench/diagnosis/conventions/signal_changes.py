@@ -45,8 +45,10 @@ class SignalChange:
 def change_signals(recording: Recording, changes: Mapping[str, SignalChange]) -> Recording:
     """Return a recording with changed signals; stated noise is scaled with its signal.
 
+    All changes refer to the signals of the given recording, so that two signals can be exchanged.
+
     Args:
-        recording: the recording.
+        recording: the recording, with its stated noise (standard deviation) by signal.
         changes: changes by the name of the signal.
     """
     noise = dict(recording.noise)
@@ -64,7 +66,8 @@ def _change_run(run: Run, changes: Mapping[str, SignalChange]) -> Run:
     run; the values are changed like those of the run.
     """
     signals = {**run.inputs, **run.channels}
-    earlier = {name: values[1] for name, values in run.before.items()}
+    earlier_times = {name: times for name, (times, _) in run.before.items()}
+    earlier_values = {name: values for name, (_, values) in run.before.items()}
 
     def convert(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
         """Return signals by name, with the changed ones converted.
@@ -81,8 +84,8 @@ def _change_run(run: Run, changes: Mapping[str, SignalChange]) -> Run:
         }
 
     before = {
-        name: np.stack([run.before[name][0], values])
-        for name, values in convert(earlier, earlier).items()
+        name: np.stack([earlier_times[name], values])
+        for name, values in convert(earlier_values, earlier_values).items()
     }
     return replace(
         run,

@@ -346,7 +346,7 @@ def find_wrong_units(
     1. Stop if the base model explains every channel well enough.
     2. Select promising hypotheses, which rescale some signals.
     3. Fit the base model again with each. A hypothesis is accepted if it removes most of the misfit
-       and other factors do not, eq. (1) of the module docstring.
+       and other factors do not.
     4. Of several, prefer the one with the fewest signals; state the others as alternatives.
 
     Args:
@@ -528,6 +528,8 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
 
 def _compute_residual_rms(residual: Array, is_recorded: Any, noise: NoiseModel) -> float:
     """Return the RMS of a residual over its samples, in units of the noise.
+
+    It is 0 without samples, and infinite if a simulation failed.
 
     Shapes: R runs, T samples, C channels.
 

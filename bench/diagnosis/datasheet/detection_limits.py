@@ -289,14 +289,19 @@ class _DetectionLimitCalculator:
         direction_set: DirectionSet,
         residual: Array,
     ) -> None:
-        """Compute the information on each candidate coefficient, eq. (1), and its step, eq. (2).
+        """Compute the information on each candidate coefficient, and its Gauss-Newton step.
 
-        The columns of the least-squares problem are the q fitted parameters, the K candidate
-        directions and the residual. `products` (q + K + 1, q + K + 1) has their inner products
-        after the initial states are projected out by a Schur complement. `projections` (K, q) has
-        the coefficients with which the parameters reproduce each direction; `powers` (K,) is the
-        information of eq. (1) that remains, and `newton_steps` (K,) the estimate after one
-        Gauss-Newton step from zero, eq. (2).
+        The columns of the least-squares problem are the q fitted parameters A, the K candidate
+        directions d_k and the residual e, whitened. The attributes are, after the initial states
+        are projected out of all columns by a Schur complement:
+
+        - `products` (q + K + 1, q + K + 1): inner products of the columns.
+        - `covariance` (q, q): (A'A)^-1.
+        - `projections` (K, q): coefficients d_k'A (A'A)^-1 with which the parameters reproduce each
+          direction.
+        - `powers` (K,): information d_k'd_k - d_k'A (A'A)^-1 A'd_k that remains, eq. (1).
+        - `newton_steps` (K,): estimate (d_k'e - d_k'A (A'A)^-1 A'e) / power after one step from
+          zero, eq. (2).
 
         Shapes: R runs, T samples, C channels.
 
@@ -310,13 +315,16 @@ class _DetectionLimitCalculator:
         self.evaluator, self.direction_set = evaluator, direction_set
         self.q = fit.free_indices.size
         self.free_indices = fit.free_indices.tolist()
-        self.free = tuple(evaluator.parameters[i].name for i in fit.free_indices.tolist())
-        parameter_columns, state_columns = fit.parameter_jacobian, fit.state_jacobian
+        self.free = tuple(evaluator.parameters[index].name for index in self.free_indices)
         columns = np.concatenate(
-            [parameter_columns, direction_set.responses, residual[..., None], state_columns], axis=3
+            [fit.parameter_jacobian, direction_set.responses, residual[..., None]], axis=3
         )
+        # Only the initial states are eliminated, so all other columns count as parameters.
         fisher_blocks = compute_fisher_blocks_from_jacobian(
-            evaluator, columns, columns.shape[3] - state_columns.shape[3], noise
+            evaluator,
+            np.concatenate([columns, fit.state_jacobian], axis=3),
+            columns.shape[3],
+            noise,
         )
         parameter_block = fisher_blocks.parameters.sum(axis=0)
         self.products, _ = compute_schur_complement(

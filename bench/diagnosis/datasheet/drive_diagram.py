@@ -126,7 +126,7 @@ def compute_drive_diagram(
     """
     joint = _Joint(subject, extended)
     zero = np.zeros(1)
-    no_load_friction = float(joint.friction(zero, zero)[0])
+    no_load_friction = float(joint.friction(zero, zero).item())
     # Without friction either, any range shows the diagram.
     load_range = force_limit or DEFAULT_LOAD_FACTOR * no_load_friction or 1.0
     load = np.linspace(-load_range, load_range, LOAD_POINT_COUNT)
@@ -147,8 +147,8 @@ def compute_drive_diagram(
         load=load,
         forward=_find_roots(lambda u: forward_balance(u, load), search_range, LOAD_POINT_COUNT),
         back=_find_roots(lambda u: backward_balance(u, load), search_range, LOAD_POINT_COUNT),
-        breakaway=float(_find_roots(lambda u: forward_balance(u, zero), search_range, 1)[0]),
-        backdrive=float(_find_roots(unpowered_balance, search_range, 1)[0]),
+        breakaway=_find_roots(lambda u: forward_balance(u, zero), search_range, 1).item(),
+        backdrive=_find_roots(unpowered_balance, search_range, 1).item(),
         laws=joint.names,
         axis_limit=load_range,
         without=joint.without,

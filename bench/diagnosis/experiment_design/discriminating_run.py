@@ -178,7 +178,7 @@ def _compute_discrimination(
     competing_model: FittedModel,
     sigma: Array,
 ) -> float:
-    """Simulate a run with two models, and return the RMS difference of their predictions, eq. (1).
+    """Simulate a run with two models, and return the RMS difference of their predictions.
 
     It is sqrt(mean over samples and channels of ((y_model - y_other) / sigma)^2), in standard
     deviations of the noise. The larger it is, the more clearly the run shows which model is right.

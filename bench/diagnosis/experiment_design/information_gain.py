@@ -168,9 +168,10 @@ class RunRanker:
     def rank_runs(self, runs: Sequence[CandidateRun]) -> list[RunValue]:
         """Return the runs within the limits, the most valuable first.
 
-        If models compete, the value of a run is their discrimination T to first order, eq. (1) of
-        the module docstring. Otherwise it is the information gain D about uncertain parameters, eq.
-        (2). Runs that cannot be simulated, or are too sensitive to the initial state, are left out.
+        If models compete, the value of a run is their discrimination T to first order: by how much
+        the models still differ on the run after the competing one has adapted to it. Otherwise it
+        is the information gain D: by how much the run narrows the uncertain parameters. Runs that
+        cannot be simulated, or are too sensitive to the initial state, are left out.
         """
         diagnosed_model = self.information[0].model
         allowed_runs = [
@@ -196,8 +197,9 @@ class RunRanker:
     ) -> RunValue:
         """Compute the value of a run to first order, from its linearisation with each model.
 
-        With several models the value is the discrimination T of eq. (1), for each pair of a true
-        and a competing model; with one model it is the information gain D of eq. (2).
+        With several models the value is the discrimination T, eq. (1) of the module docstring, for
+        each pair of a true and a competing model; with one model it is the information gain D of
+        its parameters, eq. (2).
 
         Args:
             run: run that could be recorded: its plan, scenario and initial state.
@@ -216,10 +218,11 @@ class RunRanker:
         return RunValue(run, discrimination, _sum_discrimination(discrimination))
 
     def evaluate_exactly(self, entry: RunValue) -> RunValue:
-        """Compute the discrimination T exactly, as the competing model may be far from linear.
+        """Compute the discrimination T of each pair of models exactly, by fits.
 
-        Each model of a pair is taken as true in turn. A run that violates a limit under any model
-        has the value zero.
+        A linearised value may be wrong, as the competing model may be far from linear. Each model
+        of a pair is taken as true in turn. A run that violates a limit under any model has the
+        value zero.
 
         Args:
             entry: Candidate run with its linearised value.
@@ -233,7 +236,7 @@ class RunRanker:
             )
         # The run must be within the limits, whichever model is true.
         for information in self.information[1:]:
-            if not self.limits(information.model, [entry.run])[0]:
+            if not all(self.limits(information.model, [entry.run])):
                 values[:] = 0.0
         return RunValue(entry.run, values, _sum_discrimination(values), is_exact=True)
 
@@ -410,7 +413,7 @@ class RunRanker:
 
 
 def _compute_parameter_information(models: ModelSet, model: FittedModel) -> _ParameterInformation:
-    """Compute the information on a model's parameters from the present runs, for eqs. (1) and (2).
+    """Compute the information of the present runs on a model's parameters: C^-1, and their units.
 
     The unit of each parameter, `spread`, is its standard error, but at most a tenth of the width of
     its bounds: the unit is also the step of finite differences, which would be too large for a

@@ -207,8 +207,7 @@ def build_agreement_rows(
     """Build the rows of the table of the page, the least consistent number first.
 
     Each row has a parameter, and a drawing: the 95 % intervals of all groups on one line, over that
-    of the joint fit. It is None if an
-    interval is infinite.
+    of the joint fit. It is None if an interval is infinite.
 
     Args:
         report: Data of the report, with the consistency of the extended model.

@@ -236,8 +236,7 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     Shapes: q fitted parameters.
 
     Args:
-        parameter_curvature: (q, q) curvature by the parameters alone, the first sum of eq. (1); it
-            scales the inversion.
+        parameter_curvature: (q, q) curvature by the parameters alone, which scales the inversion.
         schur_complement: (q, q) curvature after elimination of the initial states.
     """
     diagonal = np.diagonal(parameter_curvature)
@@ -288,10 +287,11 @@ def compute_fisher_blocks(models: ModelSet, model: FittedModel) -> FisherBlocks:
 def compute_fisher_blocks_from_jacobian(
     evaluator: RunEvaluator, jacobian: Array, q: int, noise: NoiseModel
 ) -> FisherBlocks:
-    """Compute the curvature blocks of eq. (1) of the module docstring from a Jacobian.
+    """Compute the curvature blocks of each run from a Jacobian, for the covariance of parameters.
 
-    The derivatives are whitened, so that their products are information in units of the noise. The
-    prior of the initial states is added to their block.
+    With the whitened derivatives A by parameters and B by initial states, they are A'A, A'B, and
+    B'B with the prior of the initial states. Whitening makes them information in units of the
+    noise.
 
     Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 

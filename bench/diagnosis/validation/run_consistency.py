@@ -407,9 +407,10 @@ def _find_trend_covariate(
     covariate, trend = best
     # A covariate that fits about as well cannot be distinguished from the best one.
     similar_covariates = [
-        other[0].name
-        for other in significant_trends
-        if other is not best and get_scatter(other) < COVARIATE_TIE_FACTOR * get_scatter(best)
+        other_covariate.name
+        for other_covariate, other_trend in significant_trends
+        if other_covariate is not covariate
+        and get_scatter((other_covariate, other_trend)) < COVARIATE_TIE_FACTOR * get_scatter(best)
     ]
     return TrendCovariate(covariate.kind, covariate.name, trend, tuple(similar_covariates))
 
@@ -512,8 +513,8 @@ def _test_parameters(
         evaluator: Run evaluator of the runs.
         model: Joint fit of all runs.
         grouping: Groups of runs, for example one for each load.
-        curvatures: (R, q, q) H_r of eq. (1), the information of each run on the parameters.
-        gradients: (R, q) g_r of eq. (1).
+        curvatures: (R, q, q) H_r, the information of each run on the parameters.
+        gradients: (R, q) g_r, the gradient of each run's log-likelihood by the parameters.
     """
     joint_errors = _compute_errors(_invert(curvatures))
     steps, errors = [], []
