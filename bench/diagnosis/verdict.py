@@ -203,13 +203,16 @@ class Verdict(Document):
 
     @property
     def bordering(self) -> dict[str, FittedValue]:
-        """Base parameters at a bound of their range, if they make the verdict `partial`."""
+        """Base parameters at a bound of their range, if they make the verdict `partial`.
+
+        A value at a bound is not a result, except zero at a lower bound, such as the coefficient
+        of a friction that does not exist.
+        """
         if self.verdict != "partial" or not self.causes:
             return {}
-        numbers = self.parameters.items()
         return {
             name: number
-            for name, number in numbers
+            for name, number in self.parameters.items()
             if number.at_bound is not None and not number.is_result
         }
 

@@ -38,7 +38,11 @@ LUMA_QUANTILES = (0.02, 0.98)
 
 
 def list_gl_backends() -> tuple[str, ...]:
-    """List the OpenGL backends to try, by MuJoCo's names; none if the user has disabled it."""
+    """List the OpenGL backends to try, by MuJoCo's names.
+
+    One that the user has chosen (``MUJOCO_GL``) comes first; the list is empty if the user has
+    disabled OpenGL.
+    """
     chosen_backend = os.environ.get("MUJOCO_GL", "").lower()
     if chosen_backend in ("disable", "disabled", "off", "false", "0"):
         return ()

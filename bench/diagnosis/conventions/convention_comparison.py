@@ -291,8 +291,12 @@ class ConventionComparison:
         """Return the joints whose conventions may be wrong.
 
         These are the joints at which the filter needs a large missing force: the standard deviation
-        of the force noise (process noise) with which it follows the readings. A wrong sign, unit or
-        joint order shows as such a force. If the filter diverges, all joints are suspects.
+        of the force noise (process noise) with which it follows the readings, relative to the
+        typical force of the joint. A wrong sign, unit or joint order shows as such a force.
+
+        - If the filter diverges, all joints are suspects.
+        - If all missing forces are negligible or not significant, no joint is.
+        - Otherwise those are whose force exceeds a limit, which depends on the largest one.
 
         Args:
             filtered_runs: Result of the filter, with the missing and the typical force of each
@@ -315,7 +319,11 @@ class ConventionComparison:
         if relative_missing_forces.max() < LARGE_MISSING_FORCE:
             limit = SIMILAR_SHARE * float(relative_missing_forces.max())
         relative_force_of = dict(zip(coordinates, relative_missing_forces.tolist(), strict=True))
-        return [j for j in self._generator.joints if relative_force_of[f"q.{j.name}"] > limit]
+        return [
+            joint
+            for joint in self._generator.joints
+            if relative_force_of[f"q.{joint.name}"] > limit
+        ]
 
     def _find_best_hypothesis(
         self, recording: Recording, suspects: Sequence[JointSignals]
@@ -504,6 +512,9 @@ class ConventionComparison:
         self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
     ) -> FollowedRuns:
         """Filter the runs for fitting with the parameters of the model file (Kalman filter).
+
+        The result has the prediction errors, and the forces that the filter needs in addition to
+        those of the model to follow the readings.
 
         Args:
             recording: the recording, transformed by a hypothesis.

@@ -235,6 +235,9 @@ class Hypothesis:
     def _format_correction(self, file: str, factors: Mapping[str, float]) -> str:
         """Write what seems wrong with a unit, sign or scale, and how the user corrects it.
 
+        The cases are a reversed sign alone, a conversion that was made twice, and a wrong unit,
+        whose sign may be reversed too. Several signals have the same mistake.
+
         Args:
             file: name of the description file.
             factors: factor by which the recorded values have to be multiplied, by signal; shown for

@@ -93,17 +93,17 @@ class SheetSubject:
         return bool(self._get_joint_place().kind == "slide")
 
     def is_driven(self, recording: Recording) -> bool:
-        """Return whether a drive acts here.
+        """Return whether a drive acts on the joint or system.
 
-        A drive is an actuator of the robot's file, or an input of the recording that is not always
-        zero.
+        A joint is driven by an actuator of the robot's file, or by its recorded force; a system by
+        any input. An input that is always zero does not count.
         """
-        inputs = {
+        active_inputs = {
             name for run in recording.runs for name, signal in run.inputs.items() if signal.any()
         }
         if not self.joint:
-            return bool(inputs)
-        return bool(self.actuators) or f"force.{self.joint}" in inputs
+            return bool(active_inputs)
+        return bool(self.actuators) or f"force.{self.joint}" in active_inputs
 
     def acts_here(self, effect: Effect | type[Effect]) -> bool:
         """Return whether an effect acts here and at one place only."""

@@ -204,11 +204,9 @@ class _Joint:
             elif law.at == "joint" and issubclass(law, Friction | Force):
                 law_values = np.array([values.get(c.name, 0.0) for c in law.coefficients])
                 self.laws.append((law(), law_values[:, None, None]))
-        file_friction = (
-            subject.get_model_file_value(f"friction.coulomb@{subject.joint}")
-            if subject.joint
-            else None
-        )
+        file_friction = None
+        if subject.joint:
+            file_friction = subject.get_model_file_value(f"friction.coulomb@{subject.joint}")
         self.stated = 0.0 if file_friction is None else file_friction.value
         self.names = tuple(law.name for law, _ in self.laws)
 

@@ -307,8 +307,8 @@ class RigModel:
         for name in limited_inputs:
             low, high = self.limits.commands[name]
             text += f", {name} limited to {low:.4g} to {high:.4g}"
-        initial_texts = [f"{name} = {value:.3g}" for name, value in plan.states]
-        text += f", from {', '.join(initial_texts)}" if initial_texts else ""
+        if plan.states:
+            text += ", from " + ", ".join(f"{name} = {value:.3g}" for name, value in plan.states)
         if plan.constants:
             text += ", with " + ", ".join(f"{name} = {value:.4g}" for name, value in plan.constants)
         if plan.hold_factor > 1:
