@@ -167,12 +167,46 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
     _fit_at_related_places(context, size)
     _refine_near(context, size)
     preferred = search.get_best(size) or best
+    merged = _replace_two_effects(context, preferred)
+    if merged is not None:
+        return fit_competing_models(context, merged)
     if preferred is best:
         return best
     # A family may replace another one, and a single member of it may be enough.
     simpler = remove_idle_effects(context, preferred)
     is_same = simpler.effects == preferred.effects
     return preferred if is_same else fit_competing_models(context, simpler)
+
+
+def _replace_two_effects(context: SearchContext, best: FittedModel) -> FittedModel | None:
+    """Return a model with one effect in place of two, if it is as good as the best one, else None.
+
+    Two effects can imitate one: more inertia and more damping of a pendulum look like less gravity.
+    Then the same effect can replace either of them, and it is tried in place of both.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model.
+    """
+    evaluator = context.evaluator
+    replaced = dict[str, dict[str, FittedModel]]()
+    for model in _list_models_near_the_best(context, len(best.effects)):
+        added = set(model.effects) - set(best.effects)
+        removed = set(best.effects) - set(model.effects)
+        if len(added) == 1:
+            replaced.setdefault(added.pop(), {})[removed.pop()] = model
+    starts = []
+    for name, models in replaced.items():
+        if len(models) < 2:
+            continue
+        likeliest = max(models.values(), key=lambda one: one.penalised_log_likelihood)
+        coefficients = likeliest.fit.theta[evaluator.coefficient_slices[name]]
+        starts.append(make_replacing_start(evaluator, best, list(models)[:2], name, coefficients))
+    fits = [context.search.fit_one(start) for start in starts]
+    merged = max(fits, key=lambda one: one.penalised_log_likelihood, default=None)
+    if merged is None or merged.penalised_log_likelihood < best.penalised_log_likelihood:
+        return None
+    return merged
 
 
 def _refine_at_force_limits(
@@ -301,13 +335,21 @@ def _confirm_by_simulation(
         competing_effect: the effect, with one coefficient, that replaces one of its effects.
         start: start of a fit of the competing model; its coefficient is scaled.
     """
-    starts = [
-        scale_effect(context, start, competing_effect.effect, factor)
-        for factor in COMPETING_FACTORS
-    ]
-    ((cost, lowest),) = select_lowest_of_each(context, starts)
     limit = best.fit.cost + MAX_SINGLE_SQUARES_SHARE * context.search.base_model.fit.cost
-    return lowest if cost < limit else None
+    factors = np.array(COMPETING_FACTORS)
+    # The second round is between the neighbours of the best factor of the first one.
+    for _ in range(2):
+        starts = [
+            scale_effect(context, start, competing_effect.effect, factor)
+            for factor in factors.tolist()
+        ]
+        ((cost, lowest),) = select_lowest_of_each(context, starts)
+        if cost < limit:
+            return lowest
+        number = next(i for i, scaled in enumerate(starts) if scaled is lowest)
+        first, last = factors[max(number - 1, 0)], factors[min(number + 1, factors.size - 1)]
+        factors = np.geomspace(first, last, factors.size)
+    return None
 
 
 def _confirm_by_filter(

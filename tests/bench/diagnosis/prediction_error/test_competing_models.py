@@ -2,14 +2,24 @@
 
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 
+from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error import competing_models, single_effect_fits
 from bench.diagnosis.prediction_error.effects_at_joints import list_joint_model_effects
 from sims.effects.drag import LinearDrag
+from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
+PENDULUM = """<mujoco model="pendulum">
+<option timestep="0.002" integrator="implicitfast"/>
+<worldbody><body name="link">
+  <joint name="hinge" axis="0 1 0" damping="0.02" armature="0.001"/>
+  <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.8"/>
+</body></worldbody>
+</mujoco>"""
 JOINT_LAWS = ("drag.linear", "friction.coulomb", "inertia.armature")
 
 
@@ -31,11 +41,15 @@ def test_laws_of_the_same_joint_compete_with_an_effect(example_arm, effect, join
 def test_a_competing_effect_is_simulated_at_several_coefficients(
     monkeypatch, lowest_cost, expected
 ):
-    """Its best coefficient is a start, unless it leaves 30 % of the squared residual."""
+    """Its best coefficient is a start, unless it leaves 30 % of the squared residual.
+
+    Then coefficients between the neighbours of the best one are tried.
+    """
+    rounds = [[0.5, 0.8, 1.0, 1.25, 2.0], np.geomspace(1.0, 2.0, 5)]
 
     def simulate(_context, starts):
         factors = [float(start.theta[0]) for start in starts]
-        assert factors == [0.5, 0.8, 1.0, 1.25, 2.0]
+        assert factors == pytest.approx(rounds.pop(0))
         return [(lowest_cost, starts[3])]
 
     monkeypatch.setattr(competing_models, "is_explained", lambda *_: True)
@@ -55,3 +69,19 @@ def test_a_competing_effect_is_simulated_at_several_coefficients(
     start = FitStart(("drag.linear@elbow",), np.ones(1), np.zeros((1, 2)))
     confirmed = competing_models._confirm(context, best, competing, start)
     assert [start.theta[0] for start in (confirmed,) if start] == expected
+    assert len(rounds) == len(expected), "a second round only if the first one found none"
+
+
+def test_one_effect_replaces_two_that_imitate_it(tmp_path):
+    """More armature and more damping of a free pendulum are exactly less gravity."""
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    model.opt.gravity[2] = -9.3
+    rng, times, runs = np.random.default_rng(11), 0.01 * np.arange(300), []
+    for start in (0.7, 1.0, 1.3):
+        readings = follow(model, np.zeros((300, 0)), 5, start=start)
+        noise = rng.normal(0.0, 1e-3, readings.shape)
+        runs.append((times, np.zeros((300, 0)), readings + noise))
+    description = describe({"q.hinge": "rad"}, 0.001)
+    log = write_log(tmp_path, description, "q.hinge", runs, arm=PENDULUM)
+    (cause,) = explain(log).answer.causes
+    assert {cause.effect, *cause.alternatives} == {"gravity.scale", "gravity.compensation@link"}
