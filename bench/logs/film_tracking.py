@@ -82,7 +82,7 @@ def track_film(
     Args:
         video: Path of the film.
         out: Path NAME.csv of the new recording; description and figure are written next to it.
-        draw: Function that draws the figure (`figures.recording_figure.render_track_figure`).
+        draw: Function that draws the figure (`figures.ball_track_figure.render_track_figure`).
         diameter: Diameter of the ball, m.
         fps: Frames per second, instead of the file's time stamps.
         scale: "camera", "diameter" or "fall"; None for the best available one.

@@ -58,7 +58,7 @@ SHORT = {
     "bench.conformance.check_suites._run_all_checks": _cut,
     "bench.logs.film_rendering.write_video": _cut,
     "bench.figures.recording_figure.write_recording_figure": _nothing,
-    "bench.figures.recording_figure.render_track_figure": lambda *_: (b"", b""),
+    "bench.figures.ball_track_figure.render_track_figure": lambda *_: (b"", b""),
     "bench.api.train.LossRecorder.write": _nothing,
 }
 """Replacements of functions that would do the actual work."""
