@@ -17,15 +17,16 @@ from bench.diagnosis.validation.held_out_runs import HeldOutRuns
 from bench.logs.recording_loading import load_recording
 from bench.logs.segmentation import segment_recording
 from sims.extended_simulator import open_extended
-from tests.exams.recordings.recording_cases import RecordingQuestion
+from tests.exams.recordings.recording_cases import SHARED, RecordingQuestion
 
 
 def explained(name, folder):
     """Explain a recording of the exam; return the answer and the path of its extended model."""
-    robots = Path(os.environ.get("SIMGAP_ROBOTS", ""))
-    if not robots.is_dir():
-        pytest.skip("no robots (set SIMGAP_ROBOTS)")
     question = RecordingQuestion(name)
+    # An empty path would be the present folder.
+    robots = Path(os.environ.get("SIMGAP_ROBOTS") or SHARED / "robots")
+    if not (robots / Path(question.system).name).is_dir() or not SHARED.is_dir():
+        pytest.skip("no robots (set SIMGAP_ROBOTS)")
     case = replace(question.draw(), folder=robots / Path(question.system).name)
     log = case.write(folder)
     explanation = explain(log)
