@@ -111,11 +111,12 @@ def list_true_parameters(folders):
 def _read_true_parameters(folders):
     import pyarrow.parquet
 
-    from bench.benchmark.storage.run_journal import read_records
+    from bench.benchmark.storage.run_journal import decode_rows, read_records
 
     for folder in folders:
         for path in folder.rglob("*.journal"):
-            for _, _, rows, _ in read_records(path):
+            for record in read_records(path):
+                rows = decode_rows(record.rows)
                 yield cube([rows["true_rate"][0].as_py(), rows["true_decay"][0].as_py()])
         for path in folder.rglob("*.parquet"):
             rows = pyarrow.parquet.read_table(path)
