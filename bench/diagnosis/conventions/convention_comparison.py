@@ -45,6 +45,7 @@ from bench.diagnosis.kalman.candidate_responses import compute_columns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.kalman.linearised_filter import MAX_LINEARISATIONS, FollowedRuns
 from bench.diagnosis.kalman.measured_joint_forces import compute_joint_forces, has_joint_forces
+from bench.diagnosis.prediction_error.effect_proposals import compute_offset_from_command
 from bench.diagnosis.prediction_error.effects_at_joints import MANY_SHAPES
 from bench.diagnosis.prediction_error.filters_with_effects import (
     GAUSS_NEWTON_STEPS,
@@ -595,7 +596,7 @@ class ConventionComparison:
             )
             best = max(best, fitted.log_likelihood - penalty)
         # 4. Effects that look like a convention.
-        for name, start in _list_similar_causes(evaluator, hypotheses).items():
+        for name, start in _list_similar_causes(filtered, hypotheses).items():
             theta = evaluator.get_nominal_theta()
             theta[evaluator.get_coefficient_indices(name)] = start
             fitted = _fit_coefficients(filtered.with_parameters(theta), [name], SIMILAR_CAUSE_STEPS)
@@ -694,7 +695,7 @@ def _estimate_white_noise(evaluator: RunEvaluator, recording: Recording) -> Nois
 
 
 def _list_similar_causes(
-    evaluator: RunEvaluator, hypotheses: Sequence[ConventionHypothesis]
+    followed: FollowedRuns, hypotheses: Sequence[ConventionHypothesis]
 ) -> dict[str, float]:
     """Return effects that change a log nearly as a hypothesis does, with a first coefficient.
 
@@ -705,30 +706,31 @@ def _list_similar_causes(
       readings differ from commands.
 
     Args:
-        evaluator: the runs as described.
+        followed: the runs as described, filtered without effects.
         hypotheses: differences of the conventions.
     """
     causes: dict[str, float] = {}
-    run, kind = evaluator.runs[0], cast(Any, evaluator.kind)
-    model = kind.robot.compiled
+    evaluator = followed.evaluator
+    coordinates = evaluator.simulator.system.coordinates
+    robot = cast(Any, evaluator.kind).robot
     for hypothesis in hypotheses:
         if hypothesis.late > 0.0:
-            lead = "servo.derivative"
-            family = [f"{lead}@*"] if f"{lead}@*" in evaluator.library else []
-            single = [name for name in evaluator.library if name.partition("@")[0] == lead]
-            causes |= dict.fromkeys(family or single, hypothesis.late)
+            leads = [n for n in evaluator.library if n.partition("@")[0] == "servo.derivative"]
+            # A robot with one servo has no effect of all servos.
+            of_all_servos = [name for name in leads if name.endswith("@*")]
+            causes |= dict.fromkeys(of_all_servos or leads, hypothesis.late)
         if not hypothesis.has_free_offset:
             continue
-        commands = [name for name in hypothesis.changes if name in run.inputs]
-        for channel in (name for name in hypothesis.changes if name not in run.inputs):
-            joint = channel.removeprefix("q.")
-            body = model.body(int(model.jnt_bodyid[kind.robot.joint(joint).id])).name
-            offset = 0.0
-            for command in commands:
-                offset = float(np.nanmean(run.channels[channel] - run.inputs[command]))
-                causes[f"input.bias@{command.removeprefix('u.')}"] = 0.0
-            causes |= {f"sensor.bias@{channel}": offset, f"force.bias@{joint}": 0.0}
-            causes[f"mass.offset@{body}"] = 0.0
+        for name in hypothesis.changes:
+            if name not in coordinates:
+                causes[f"input.bias@{name.removeprefix('u.')}"] = 0.0
+                continue
+            joint = name.removeprefix("q.")
+            body = robot.compiled.body(int(robot.compiled.jnt_bodyid[robot.joint(joint).id])).name
+            causes |= {f"force.bias@{joint}": 0.0, f"mass.offset@{body}": 0.0}
+            causes[f"sensor.bias@{name}"] = compute_offset_from_command(
+                evaluator, followed.noise, coordinates.index(name)
+            )
     return {name: start for name, start in causes.items() if name in evaluator.library}
 
 

@@ -45,6 +45,7 @@ from bench.diagnosis.prediction_error.single_effect_fits import (
     refine_single_effects,
     scale_effect,
 )
+from bench.diagnosis.search.alternative_causes import differ_in_one_effect
 from sims.core.simulator import Array
 
 FURTHER_STEPS = 4
@@ -191,10 +192,10 @@ def _replace_two_effects(context: SearchContext, best: FittedModel) -> FittedMod
     evaluator = context.evaluator
     replaced = dict[str, dict[str, FittedModel]]()
     for model in _list_models_near_the_best(context, len(best.effects)):
-        added = set(model.effects) - set(best.effects)
-        removed = set(best.effects) - set(model.effects)
-        if len(added) == 1:
-            replaced.setdefault(added.pop(), {})[removed.pop()] = model
+        if differ_in_one_effect(best, model):
+            (removed,) = set(best.effects) - set(model.effects)
+            (added,) = set(model.effects) - set(best.effects)
+            replaced.setdefault(added, {})[removed] = model
     starts = []
     for name, models in replaced.items():
         if len(models) < 2:
@@ -348,7 +349,7 @@ def _confirm_by_simulation(
             return lowest
         number = next(i for i, scaled in enumerate(starts) if scaled is lowest)
         first, last = factors[max(number - 1, 0)], factors[min(number + 1, factors.size - 1)]
-        factors = np.geomspace(first, last, factors.size)
+        factors = np.geomspace(first, last, factors.size + 2)[1:-1]
     return None
 
 

@@ -231,7 +231,7 @@ class EffectProposals:
         """
         evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         coefficients = {
-            f"sensor.bias@q.{place}": _compute_offset_from_command(
+            f"sensor.bias@q.{place}": compute_offset_from_command(
                 evaluator, self.filters.noise, joint
             )
         }
@@ -381,7 +381,7 @@ class EffectProposals:
         return step
 
 
-def _compute_offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) -> float:
+def compute_offset_from_command(evaluator: RunEvaluator, noise: NoiseModel, joint: int) -> float:
     """Return the mean difference in rad or m of a joint's readings from its servo's command.
 
     It is a first guess of an encoder offset. The command acts on the actuator, so it is multiplied

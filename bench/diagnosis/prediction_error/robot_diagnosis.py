@@ -21,6 +21,7 @@ from bench.diagnosis.prediction_error.regression_selection import compute_p_valu
 from bench.diagnosis.search.alternative_causes import (
     AlternativeFinder,
     CauseEvidence,
+    differ_in_one_effect,
     select_preferred_model,
 )
 from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_gap_closed
@@ -165,8 +166,7 @@ class Confirmation(Inquiry):
         competitors = [
             other
             for other in search.models.values()
-            if len(other.effects) == len(model.effects)
-            and len(set(other.effects) - set(model.effects)) == 1
+            if differ_in_one_effect(model, other)
             and other.penalised_log_likelihood > model.penalised_log_likelihood - reach
         ]
         competitors.sort(key=lambda other: -other.penalised_log_likelihood)

@@ -93,7 +93,7 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     starts += [
         _make_swapped_start(search, model, candidate)
         for candidate in compared_models
-        if _differs_in_one(model, candidate)
+        if len(model.effects) > 1 and differ_in_one_effect(model, candidate)
     ]
     search.refit_models([*starts, *neighbour_starts], noise)
     # A refit that ends worse is not stored, so the table contains the best fit of each model.
@@ -125,9 +125,10 @@ def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
     return best
 
 
-def _differs_in_one(model: FittedModel, other_model: FittedModel) -> bool:
-    """Return whether `other_model` has all effects except one of a model with several effects."""
-    return len(model.effects) > 1 and len(set(model.effects) - set(other_model.effects)) == 1
+def differ_in_one_effect(model: FittedModel, other_model: FittedModel) -> bool:
+    """Return whether models have as many effects, and all in common except one of each."""
+    has_same_size = len(model.effects) == len(other_model.effects)
+    return has_same_size and len(set(model.effects) - set(other_model.effects)) == 1
 
 
 def _make_swapped_start(

@@ -75,3 +75,51 @@ def describe(units, noise=None, more="", model="arm"):
         channel_noise = noise.get(name) if isinstance(noise, dict) else noise
         lines += [] if is_input or channel_noise is None else [f"noise = {channel_noise}"]
     return "\n".join([*lines, more])
+
+
+SERVO_ARM = """<mujoco model="arm">
+<option timestep="0.002" integrator="implicitfast"/>
+<worldbody><body name="link">
+  <joint name="hinge" axis="0 1 0" damping="0.1" armature="0.01"/>
+  <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.8"/>
+</body></worldbody>
+<actuator><position name="servo" joint="hinge" kp="20" kv="1"/></actuator>
+</mujoco>"""
+"""Arm with one joint and a servo."""
+
+
+def record_servo_arm(
+    folder, model, seed=3, amplitudes=(0.9, 0.4), offset=0.0, lead=0.0, push=lambda data: 0.0
+):
+    """Record three runs of 3 s of a changed servo arm in plain MuJoCo, described by `SERVO_ARM`.
+
+    Args:
+        folder: folder of the log.
+        model: compiled model, which may differ from `SERVO_ARM`.
+        seed: seed of the phases and of the sensor noise of 1 mrad.
+        amplitudes: amplitudes of the two sines of a command, in rad.
+        offset: offset of the encoder, in rad.
+        lead: kd / kp, in s, of a D term on the error; the controller computes the rate of the set
+            point from its values at this time step and the last.
+        push: function of MuJoCo's data that returns a torque at the joint, in N m.
+
+    Returns:
+        Path of the log.
+    """
+    step, gain = model.opt.timestep, model.actuator_gainprm[0, 0]
+    rng, times, runs = np.random.default_rng(seed), 0.01 * np.arange(300), []
+    for _ in range(3):
+        phases = rng.uniform(0.0, 6.0, 2)
+        commands = amplitudes[0] * np.sin(2.0 * times + phases[0])
+        commands += amplitudes[1] * np.sin(5.1 * times + phases[1])
+
+        def act(data, commands=commands):
+            now, before = (
+                commands[int(max(data.time - late, 0.0) / 0.01 + 1e-6)] for late in (0.0, step)
+            )
+            data.qfrc_applied[0] = push(data) + gain * lead * (now - before) / step
+
+        readings = offset + follow(model, commands, 5, start=commands[0], act=act)
+        runs.append((times, commands, readings + rng.normal(0.0, 1e-3, readings.shape)))
+    description = describe({"u.servo": "rad", "q.hinge": "rad"}, 0.001)
+    return write_log(folder, description, "u.servo,q.hinge", runs, arm=SERVO_ARM)

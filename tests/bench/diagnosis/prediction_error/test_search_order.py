@@ -9,16 +9,8 @@ import pytest
 from bench.diagnosis.explain import explain
 from bench.diagnosis.prediction_error import prediction_error_search
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
-from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
+from tests.bench.diagnosis.simulated_logs import SERVO_ARM, record_servo_arm
 
-ARM = """<mujoco model="arm">
-<option timestep="0.002" integrator="implicitfast"/>
-<worldbody><body>
-  <joint name="hinge" axis="0 1 0" damping="0.1" armature="0.01"/>
-  <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.8"/>
-</body></worldbody>
-<actuator><position name="servo" joint="hinge" kp="20" kv="1"/></actuator>
-</mujoco>"""
 RIPPLE = 0.35
 """Amplitude of the ripple, N m."""
 PERIOD = 0.4
@@ -26,20 +18,12 @@ PERIOD = 0.4
 
 
 def write_recording(folder):
-    """Record three runs in plain MuJoCo, with a torque that varies with the angle."""
-
-    def push(data):
-        data.qfrc_applied[0] = RIPPLE * np.sin(2.0 * np.pi * data.qpos[0] / PERIOD)
-
-    model = mujoco.MjModel.from_xml_string(ARM)
-    rng, times, runs = np.random.default_rng(3), 0.01 * np.arange(300), []
-    for _ in range(3):
-        phases = rng.uniform(0.0, 6.0, 2)
-        commands = 0.9 * np.sin(2.0 * times + phases[0]) + 0.4 * np.sin(5.1 * times + phases[1])
-        readings = follow(model, commands, 5, start=commands[0], act=push)
-        runs.append((times, commands, readings + rng.normal(0.0, 1e-3, readings.shape)))
-    description = describe({"u.servo": "rad", "q.hinge": "rad"}, 0.001)
-    return write_log(folder, description, "u.servo,q.hinge", runs, arm=ARM)
+    """Record runs with a torque that varies with the angle."""
+    return record_servo_arm(
+        folder,
+        mujoco.MjModel.from_xml_string(SERVO_ARM),
+        push=lambda data: RIPPLE * np.sin(2.0 * np.pi * data.qpos[0] / PERIOD),
+    )
 
 
 def test_a_ripple_is_found_with_few_simulations(tmp_path):
@@ -57,24 +41,8 @@ LEAD = 0.05
 
 
 def test_a_d_term_on_the_error_is_not_a_command_ahead_of_its_time(tmp_path):
-    """A controller of 500 Hz computes the rate of the set point from its last two values."""
-    model = mujoco.MjModel.from_xml_string(ARM)
-    step, gain = model.opt.timestep, model.actuator_gainprm[0, 0]
-    rng, times, runs = np.random.default_rng(3), 0.01 * np.arange(300), []
-    for _ in range(3):
-        phases = rng.uniform(0.0, 6.0, 2)
-        commands = 0.9 * np.sin(2.0 * times + phases[0]) + 0.4 * np.sin(5.1 * times + phases[1])
-
-        def push(data, commands=commands):
-            now, before = (
-                commands[int(max(data.time - late, 0.0) / 0.01 + 1e-6)] for late in (0.0, step)
-            )
-            data.qfrc_applied[0] = gain * LEAD * (now - before) / step
-
-        readings = follow(model, commands, 5, start=commands[0], act=push)
-        runs.append((times, commands, readings + rng.normal(0.0, 1e-3, readings.shape)))
-    description = describe({"u.servo": "rad", "q.hinge": "rad"}, 0.001)
-    answer = explain(write_log(tmp_path, description, "u.servo,q.hinge", runs, arm=ARM)).answer
+    model = mujoco.MjModel.from_xml_string(SERVO_ARM)
+    answer = explain(record_servo_arm(tmp_path, model, lead=LEAD)).answer
     assert answer.verdict == "named"
     (cause,) = answer.causes
     assert (cause.effect, cause.alternatives) == ("servo.derivative@servo", ())
@@ -83,16 +51,9 @@ def test_a_d_term_on_the_error_is_not_a_command_ahead_of_its_time(tmp_path):
 
 def test_damping_of_a_joint_and_of_its_servo_are_one_set(tmp_path):
     """The first selection is wrong, and with it its share of the integrator's errors."""
-    model = mujoco.MjModel.from_xml_string(ARM.replace('damping="0.1"', 'damping="0.35"'))
-    rng, times, runs = np.random.default_rng(0), 0.01 * np.arange(300), []
-    for _ in range(3):
-        phases = rng.uniform(0.0, 6.0, 2)
-        commands = 0.9 * np.sin(2.0 * times + phases[0]) + 0.4 * np.sin(5.1 * times + phases[1])
-        readings = follow(model, commands, 5, start=commands[0])
-        runs.append((times, commands, readings + rng.normal(0.0, 1e-3, readings.shape)))
-    description = describe({"u.servo": "rad", "q.hinge": "rad"}, 0.001)
-    answer = explain(write_log(tmp_path, description, "u.servo,q.hinge", runs, arm=ARM)).answer
-    (cause,) = answer.causes
+    model = mujoco.MjModel.from_xml_string(SERVO_ARM)
+    model.dof_damping[0] = 0.35
+    (cause,) = explain(record_servo_arm(tmp_path, model, seed=0)).answer.causes
     assert {cause.effect, *cause.alternatives} == {"drag.linear@hinge", "actuator.damping@servo"}
 
 
