@@ -350,8 +350,11 @@ class RecordingTable:
             InputError: the cell does not; the message states its row and column.
         """
         if not (_NUMBER_PATTERN.fullmatch(cell) and math.isfinite(float(cell))):
-            missing = name in self.inputs and not cell.strip()
-            note = "; an input has no missing samples" if missing else ""
+            note = ""
+            if name in self.gaps:
+                note = "; leave the cell empty if the sample is missing"
+            elif name in self.inputs and not cell.strip():
+                note = "; an input has no missing samples"
             self.raise_error(
                 record, name, f"expected a finite number, found {format_value(cell)}{note}"
             )

@@ -90,6 +90,7 @@ def check_refused(path, message):
     ("old", "new", "message"),
     [
         ("0.5,0.1", "0.5,abc", "log.csv, row 3, column x: expected a finite number, found 'abc'"),
+        ("0.5,0.1", "0.5,abc", "found 'abc'; leave the cell empty if the sample is missing"),
         ("0.5,0.1", "0.5,inf", "row 3, column x: expected a finite number, found 'inf'"),
         ("0.5,0.1", "0.5,nan", "row 3, column x: expected a finite number, found 'nan'"),
         ("1,0.5,", "1,,", "row 3, column t: expected a finite number, found ''"),
