@@ -37,7 +37,7 @@ class FeatureConfig:
         raw: True for the resampled series in SI units without weights, as published; the other
             settings then have no effect.
         use_scenario_features: True to use scenario information too, if scenarios differ in it
-            (`methods.learning.input_features`).
+            (`methods.learning.scenario_features`).
         channels: indices of the first and the last channel that are used; None for all.
         clean: whether targets may be noise-free; if not, only the network for noisy targets is
             trained.

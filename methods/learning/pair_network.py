@@ -214,10 +214,8 @@ def train_pair_network(
         rates = [design.rate * _LEARNING_RATE_DECAY**epoch for epoch in range(design.epochs)]
         optimiser_class: Any = torch.optim.SGD
         if design.adam:
-            optimiser_class, rates = (
-                torch.optim.Adam,
-                compute_cosine_rates(design.rate, design.epochs),
-            )
+            optimiser_class = torch.optim.Adam
+            rates = compute_cosine_rates(design.rate, design.epochs)
 
         def draw_batches() -> Any:
             order: Any = torch.randperm(len(proposed_rows), generator=generator)

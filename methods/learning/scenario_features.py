@@ -198,47 +198,21 @@ class ScenarioFeatures:
         # Equal scenarios give constant inputs, which carry no information.
         if not has_varying_inputs and not _differs_between_scenarios(initial):
             return None
-        count = initial.shape[1]
-        # A preliminary map for the raw numbers: one number beyond the initial values marks varying
-        # inputs.
-        unscaled = cls(
-            centre=np.empty(count + has_varying_inputs), spread=np.empty(0), initial=count
-        )
         table = np.concatenate(
             [
-                unscaled.compute(observation, lengths, scene)
+                _compute_unscaled_numbers(observation, lengths, scene, has_varying_inputs)
                 for observation, scene in zip(observations, scenes, strict=True)
             ]
         )
         # Medians are used, because a fitted coefficient can be far off if a run hardly moves.
         centre = np.median(table, axis=0)
         distances = np.abs(table - centre)
-        return cls(centre, _STD_PER_MAD * np.median(distances, axis=0), count)
+        return cls(centre, _STD_PER_MAD * np.median(distances, axis=0), initial.shape[1])
 
     @property
     def has_varying_inputs(self) -> bool:
         """True if inputs vary between scenarios, so that response coefficients are computed."""
         return self.initial < len(self.centre)
-
-    def compute(self, observations: Array, lengths: tuple[int, ...], scene: ScenarioInfo) -> Array:
-        """Compute the unscaled numbers of observations in one scenario.
-
-        Shapes: T samples, C channels.
-
-        Args:
-            observations: (n, T, C) observations in SI units.
-            lengths: number of samples of each run.
-            scene: scenario information.
-
-        Returns:
-            (n, K) numbers.
-        """
-        shape = len(observations), len(scene.initial)
-        initial = np.broadcast_to(scene.initial, shape)
-        if not self.has_varying_inputs:
-            return initial
-        coefficients = compute_response_coefficients(observations, scene.inputs, lengths)
-        return np.concatenate([initial, coefficients], axis=1)
 
     def __call__(self, observations: Array, lengths: tuple[int, ...], scene: ScenarioInfo) -> Array:
         """Compute network inputs, which grow logarithmically far from the training data.
@@ -256,7 +230,7 @@ class ScenarioFeatures:
         Raises:
             ValueError: the scenario has another number of values than those of the training.
         """
-        features = self.compute(observations, lengths, scene)
+        features = _compute_unscaled_numbers(observations, lengths, scene, self.has_varying_inputs)
         if len(scene.initial) != self.initial or features.shape[1] != len(self.centre):
             raise ValueError(
                 f"the network expects {len(self.centre)} numbers of a scenario, "
@@ -269,6 +243,20 @@ class ScenarioFeatures:
         # arcsinh is the identity near zero and logarithmic far out, so outliers do not saturate
         # units.
         return np.asarray(np.arcsinh((features - self.centre) * scale), dtype=np.float64)
+
+
+def _compute_unscaled_numbers(
+    observations: Array, lengths: tuple[int, ...], scene: ScenarioInfo, has_varying_inputs: bool
+) -> Array:
+    """Compute the numbers (n, K) that describe a scenario, for each of n observations (n, T, C).
+
+    They are the initial values, and the response coefficients if inputs vary between scenarios.
+    """
+    initial = np.broadcast_to(scene.initial, (len(observations), len(scene.initial)))
+    if not has_varying_inputs:
+        return initial
+    coefficients = compute_response_coefficients(observations, scene.inputs, lengths)
+    return np.concatenate([initial, coefficients], axis=1)
 
 
 def _differs_between_scenarios(numbers: Array) -> bool:

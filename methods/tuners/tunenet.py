@@ -6,10 +6,7 @@ simulation and o_T of the target. Algorithm 1 repeats
     (1)  zeta_k = zeta_{k-1} + h(o_P, o_T)
 
 which stops at a root of h as a function of zeta, wherever that is. Here the root is sought by
-Broyden's method (Math. Comp. 19, 1965), with the slope B of h, a step s and the change y of h:
-
-    (2)  s = -B^-1 h,  at first B = -1, which is (1)
-    (3)  B <- B + (y - B s) s^T / (s^T s)
+Broyden's method (`methods.learning.broyden_search`), whose first step is (1).
 """
 
 from __future__ import annotations
@@ -94,7 +91,7 @@ class TuneNet(PairTuner):
         """Run Algorithm 1, with one simulation per iteration.
 
         Each guess is the last one plus the network's estimate of the difference to the target (1),
-        or a step of Broyden's method (2) with `broyden`, which ends when the guess no longer
+        or a step of Broyden's method with `broyden`, which ends when the guess no longer
         changes.
 
         Args:
