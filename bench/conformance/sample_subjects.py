@@ -105,7 +105,7 @@ TRAINED_TUNERS: dict[tuple[type[Tuner], int], dict[str, Array]] = {}
 """Trained state of each tuner in this process, by class and dimension, because training is slow."""
 
 
-def make_trained_tuner(kind: type[Tuner], dim: int, anew: bool = False) -> Tuner:
+def make_trained_tuner(kind: type[Tuner], dim: int = 2, anew: bool = False) -> Tuner:
     """Make a tuner, trained on the toy problem if necessary.
 
     Args:
@@ -123,12 +123,12 @@ def make_trained_tuner(kind: type[Tuner], dim: int, anew: bool = False) -> Tuner
     return tuner
 
 
-def make_task(dim: int, budget: int, seed: int = 0) -> tuple[Task, Array]:
+def make_task(budget: int, dim: int = 2, seed: int = 0) -> tuple[Task, Array]:
     """Make a task with its true parameters; its arrays are read-only.
 
     Args:
-        dim: number of parameters.
         budget: maximum number of simulations.
+        dim: number of parameters.
         seed: seed of the true parameters and of the start.
 
     Returns:
@@ -147,8 +147,8 @@ def make_task(dim: int, budget: int, seed: int = 0) -> tuple[Task, Array]:
 
 def run_tuner(
     tuner: Tuner,
-    dim: int,
     budget: int,
+    dim: int = 2,
     seed: int = 0,
     fails: Callable[[int], bool] = lambda _: False,
     target: int = 0,
@@ -157,13 +157,13 @@ def run_tuner(
 
     Args:
         tuner: instance of the tuner.
-        dim: number of parameters.
         budget: maximum number of simulations.
+        dim: number of parameters.
         seed: seed of the run.
         fails: returns whether simulation number k fails.
         target: seed of the task.
     """
-    task, _ = make_task(dim, budget, target)
+    task, _ = make_task(budget, dim, target)
     evaluate = make_evaluate(task, fails)
     return drive_tuner(tuner, task, evaluate, np.random.default_rng(seed))
 

@@ -54,11 +54,9 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
     tuned = _make_tuner_spec(kind)
     if tuned is None:
         return NotApplicable("its class is in no plugin file and no installed package")
-    local_trace = run_tuner(
-        make_trained_tuner(kind, dim=2), dim=2, budget=_RUN_SIMULATIONS, seed=_SEED
-    )
-    state = make_trained_tuner(kind, dim=2).state() if kind.learned else None
-    task, _ = make_task(dim=2, budget=_RUN_SIMULATIONS)
+    local_trace = run_tuner(make_trained_tuner(kind), budget=_RUN_SIMULATIONS, seed=_SEED)
+    state = make_trained_tuner(kind).state() if kind.learned else None
+    task, _ = make_task(budget=_RUN_SIMULATIONS)
     location = f"{kind.__name__}: what needs files, the network or processes; docs/isolation.md"
     try:
         with start_isolated_tuner(tuned, _SEED, "run", state=state) as tuner:
@@ -147,9 +145,7 @@ def check_api_is_complete(kind: type[Tuner]) -> None:
         ) from None
     # The returned object is tested: a `tune` that returns a list would only fail in the harness's
     # loop. A learned tuner must be trained before.
-    steps = make_trained_tuner(kind, dim=2).tune(
-        make_task(dim=2, budget=5)[0], np.random.default_rng(0)
-    )
+    steps = make_trained_tuner(kind).tune(make_task(budget=5)[0], np.random.default_rng(0))
     check(
         inspect.isgenerator(steps),
         "a generator (with a yield)",
@@ -187,10 +183,10 @@ def check_budget_is_exact(kind: type[Tuner]) -> None:
 
     A tuner may end early if it gives a reason.
     """
-    tuner = make_trained_tuner(kind, dim=2)
+    tuner = make_trained_tuner(kind)
     # Populations are larger than these budgets, so a batch must be cut.
     for budget in range(1, 8):
-        trace = run_tuner(tuner, dim=2, budget=budget)
+        trace = run_tuner(tuner, budget=budget)
         _check_run_completed(kind, trace, f"with budget {budget}")
         # Fewer simulations are correct if the tuner gives a reason.
         used_simulations = len(trace.losses)
@@ -258,8 +254,8 @@ class _InspectedTuner(Tuner):
 
 def _inspect_run(kind: type[Tuner]) -> _InspectedTuner:
     """Run the tuner under test on the toy problem with 30 simulations, and return what it did."""
-    inspected = _InspectedTuner(make_trained_tuner(kind, dim=2))
-    run_tuner(inspected, dim=2, budget=30)
+    inspected = _InspectedTuner(make_trained_tuner(kind))
+    run_tuner(inspected, budget=30)
     return inspected
 
 
@@ -294,12 +290,12 @@ def check_same_seed_gives_the_same_run(kind: type[Tuner]) -> None:
     The global random generators have different states in the two runs.
     """
     # Two runs of one instance, because state left by a run must not matter either.
-    tuner = make_trained_tuner(kind, dim=2)
-    first_run = run_tuner(tuner, dim=2, budget=25, seed=3)
+    tuner = make_trained_tuner(kind)
+    first_run = run_tuner(tuner, budget=25, seed=3)
     saved_state = np.random.get_state()  # noqa: NPY002
     np.random.seed(12345)  # noqa: NPY002 - a tuner that draws from it would now differ
     try:
-        second_run = run_tuner(tuner, dim=2, budget=25, seed=3)
+        second_run = run_tuner(tuner, budget=25, seed=3)
     finally:
         np.random.set_state(saved_state)  # noqa: NPY002
     is_same = is_bitwise_equal(first_run.proposals, second_run.proposals) and is_bitwise_equal(
@@ -316,10 +312,10 @@ def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
     Args:
         kind: Tuner class under test.
     """
-    used_tuner = make_trained_tuner(kind, dim=2)
-    run_tuner(used_tuner, dim=2, budget=15, seed=1)
-    used_trace = run_tuner(used_tuner, dim=2, budget=15, seed=2)
-    fresh_trace = run_tuner(make_trained_tuner(kind, dim=2), dim=2, budget=15, seed=2)
+    used_tuner = make_trained_tuner(kind)
+    run_tuner(used_tuner, budget=15, seed=1)
+    used_trace = run_tuner(used_tuner, budget=15, seed=2)
+    fresh_trace = run_tuner(make_trained_tuner(kind), budget=15, seed=2)
     is_same = is_bitwise_equal(used_trace.proposals, fresh_trace.proposals)
     check(
         is_same,
@@ -331,9 +327,9 @@ def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
 
 def check_global_random_state_is_left_alone(kind: type[Tuner]) -> None:
     """Check that neither training nor tuning uses or seeds a global random generator."""
-    run_tuner(make_trained_tuner(kind, dim=2), dim=2, budget=3)  # performs lazy imports
+    run_tuner(make_trained_tuner(kind), budget=3)  # performs lazy imports
     with check_global_random_state(f"{kind.__name__}.fit and .tune: use rng"):
-        run_tuner(make_trained_tuner(kind, dim=2, anew=True), dim=2, budget=15)
+        run_tuner(make_trained_tuner(kind, anew=True), budget=15)
 
 
 def check_stochastic_is_declared(kind: type[Tuner]) -> NotApplicable | None:
@@ -349,10 +345,10 @@ def check_stochastic_is_declared(kind: type[Tuner]) -> NotApplicable | None:
     """
     if kind.stochastic:
         return NotApplicable("it declares that it is random")
-    tuner = make_trained_tuner(kind, dim=2)
+    tuner = make_trained_tuner(kind)
     is_same = is_bitwise_equal(
-        run_tuner(tuner, dim=2, budget=15, seed=1).proposals,
-        run_tuner(tuner, dim=2, budget=15, seed=2).proposals,
+        run_tuner(tuner, budget=15, seed=1).proposals,
+        run_tuner(tuner, budget=15, seed=2).proposals,
     )
     location = f"{kind.__name__}.stochastic"
     check(is_same, "stochastic = True", "another run with another seed", location)
@@ -364,14 +360,14 @@ def check_failed_simulations_are_survived(kind: type[Tuner]) -> None:
 
     The first simulation, every third one, or all of them fail.
     """
-    tuner = make_trained_tuner(kind, dim=2)
+    tuner = make_trained_tuner(kind)
     # Methods start from the first simulation; if all fail, nothing can be fitted. k counts from 1.
     for fails, condition in (
         (lambda k: k == 1, "when the first simulation fails"),
         (lambda k: k % 3 == 0, "when every third simulation fails"),
         (lambda _: True, "when every simulation fails"),
     ):
-        trace = run_tuner(tuner, dim=2, budget=15, fails=fails)
+        trace = run_tuner(tuner, budget=15, fails=fails)
         # A run without a finite loss has the status `diverged`, however the tuner ends it.
         if trace.status != "diverged" or np.isfinite(trace.losses).any():
             _check_run_completed(kind, trace, condition)
@@ -382,8 +378,8 @@ def check_easy_problem_is_improved(kind: type[Tuner]) -> None:
 
     The error of the recommendation after 60 simulations must be below half of the start's.
     """
-    trace = run_tuner(make_trained_tuner(kind, dim=2), dim=2, budget=60)
-    task, truth = make_task(dim=2, budget=60)
+    trace = run_tuner(make_trained_tuner(kind), budget=60)
+    task, truth = make_task(budget=60)
     initial_error, final_error = (
         np.abs(point - truth).mean() for point in (task.start, trace.recommendations[-1])
     )
@@ -407,7 +403,7 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
     """
     from scipy.stats import wilcoxon
 
-    tuner, random_search = make_trained_tuner(kind, dim=2), _RandomSearchBaseline()
+    tuner, random_search = make_trained_tuner(kind), _RandomSearchBaseline()
     # Bonferroni correction: three looks at 5 % in total.
     level = _SIGNIFICANCE_LEVEL / len(_SEQUENTIAL_TEST_TARGETS)
     log_errors: list[Array] = []  # of the tuner and of random search, one pair per target
@@ -438,8 +434,8 @@ def _compute_final_log_errors(subjects: tuple[Tuner, ...], target: int) -> Array
         subjects: the tuners.
         target: number of the target, which is also the seed.
     """
-    _, truth = make_task(dim=2, budget=30, seed=target)
-    traces = [run_tuner(tuner, dim=2, budget=30, seed=target, target=target) for tuner in subjects]
+    _, truth = make_task(budget=30, seed=target)
+    traces = [run_tuner(tuner, budget=30, seed=target, target=target) for tuner in subjects]
     return np.log(
         [max(np.abs(trace.recommendations[-1] - truth).mean(), 1e-12) for trace in traces]
     )
@@ -471,9 +467,7 @@ def compute_run_digests(
     """
     if learned:
         TRAINED_TUNERS[kind, 2] = learned
-    traces = [
-        run_tuner(make_trained_tuner(kind, dim=2), dim=2, budget=12, seed=seed) for seed in seeds
-    ]
+    traces = [run_tuner(make_trained_tuner(kind), budget=12, seed=seed) for seed in seeds]
     return [
         hashlib.sha256(trace.proposals.tobytes() + trace.recommendations.tobytes()).hexdigest()[:16]
         for trace in traces
@@ -513,7 +507,7 @@ def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> NotApplicable | N
     """
     if not kind.learned:
         return NotApplicable("it does not learn")
-    tuner, restored_tuner = make_trained_tuner(kind, dim=2), kind()
+    tuner, restored_tuner = make_trained_tuner(kind), kind()
     state = tuner.state()
     # Floating-point numbers, integers and unsigned integers.
     is_numeric = all(
@@ -525,8 +519,8 @@ def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> NotApplicable | N
     # elsewhere.
     restored_tuner.restore(state)
     is_same = is_bitwise_equal(
-        run_tuner(tuner, dim=2, budget=5).proposals,
-        run_tuner(restored_tuner, dim=2, budget=5).proposals,
+        run_tuner(tuner, budget=5).proposals,
+        run_tuner(restored_tuner, budget=5).proposals,
     )
     check(is_same, "the same run after restore", "another one", f"{kind.__name__}.restore")
     # Weights of another version or another tuner must not be accepted.
