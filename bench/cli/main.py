@@ -33,13 +33,14 @@ class Command(NamedTuple):
 
     Attributes:
         name: Name of the command.
-        place: Module of `bench.cli.commands` and its function that adds the options.
+        function_path: Module of `bench.cli.commands` and its function that adds the options, with a
+            colon between them.
         summary: What the command does, as the beginning of a sentence without a full stop.
         example: A command line that works.
     """
 
     name: str
-    place: str
+    function_path: str
     summary: str
     example: str
 

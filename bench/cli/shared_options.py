@@ -253,9 +253,12 @@ def parse_key_numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
     }
 
 
-def is_path_argument(action: argparse.Action) -> bool:
-    """Return whether an argument is the path of a file or folder."""
-    return action.type in (parse_path, parse_file_name)
+def get_subparsers(parser: argparse.ArgumentParser) -> argparse._SubParsersAction[Any]:
+    """Return the commands of the whole command line; argparse has no public way to list them."""
+    (commands,) = [
+        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+    ]
+    return commands
 
 
 _PARSERS_BY_ANNOTATION: Mapping[str, tuple[Callable[[str], Any], str]] = {

@@ -9,7 +9,7 @@ import argparse
 from typing import Any
 
 from bench.cli.output import CommandResult, PrintLine
-from bench.cli.shared_options import is_path_argument
+from bench.cli.shared_options import get_subparsers, parse_file_name, parse_path
 
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 _BASH_FUNCTIONS = """
@@ -48,11 +48,7 @@ def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
     from bench.core.plugin_registries import REGISTRIES
     from bench.schemas import list_schema_names
 
-    # argparse has no public way to list the arguments of a parser.
-    (commands,) = [
-        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
-    ]
-    for name, command in commands.choices.items():
+    for name, command in get_subparsers(parser).choices.items():
         for action in command._actions:
             _set_completion(name, action, shtab)
     names = {
@@ -86,7 +82,7 @@ def _set_completion(command: str, action: argparse.Action, shtab: Any) -> None:
     bash_function = _BASH_COMPLETERS.get((command, action.dest))
     if bash_function:
         complete = {**shtab.FILE, "bash": bash_function}
-    elif is_path_argument(action):
+    elif action.type in (parse_path, parse_file_name):
         complete = shtab.FILE
     else:
         return

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from bench.cli.output import EXIT_CODES, CommandResult, JsonDocument, PrintLine, format_json
-from bench.cli.shared_options import add_plugin_option, parse_path
+from bench.cli.shared_options import add_plugin_option, get_subparsers, parse_path
 from sims.core.plain_values import append_unit, format_unit
 
 if TYPE_CHECKING:
@@ -126,11 +126,8 @@ def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
         One JSON document per command: name, help text, schema of its output, exit codes and
         options.
     """
-    # argparse has no public way to list the arguments of a parser.
-    (choices,) = [
-        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
-    ]
-    summaries = {action.dest: action.help for action in choices._choices_actions}
+    subparsers = get_subparsers(parser)
+    summaries = {action.dest: action.help for action in subparsers._choices_actions}
     return [
         {
             "name": name,
@@ -143,7 +140,7 @@ def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
                 if not isinstance(action, argparse._HelpAction)
             ],
         }
-        for name, command in choices.choices.items()
+        for name, command in subparsers.choices.items()
     ]
 
 
