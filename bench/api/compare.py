@@ -419,11 +419,10 @@ class ComparisonResult:
         )
 
     def summary(self) -> pd.DataFrame:
-        """Return each tuner's last error of the first metric in ranking order, with its verdict.
+        """Return each tuner's last error of the first metric, with its verdict and failed runs.
 
-        Failures are counted, too.
-
-        For diagnosers, the measures of each diagnoser.
+        The tuners are in the order of their ranking. For diagnosers, the measures of each diagnoser
+        are returned.
         """
         table = self.table
         if self.experiment.diagnosis:

@@ -1,4 +1,4 @@
-"""Calibration recording of a misspecified simulator.
+"""Calibration recording of a misspecified simulator, and labels of the two simulators of a study.
 
 The recording contains nothing of the targets: its parameters, initial states, inputs and noise are
 drawn from separate random streams.
@@ -19,6 +19,10 @@ from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import ModelFileReference
 from sims.recording.recording_writer import write_recording
+
+PLAIN, EXTENDED = "plain", "extended"
+"""Names of the simulators in which tuners are compared: the original and the extended one."""
+MODEL_LABELS = (PLAIN, EXTENDED)
 
 
 def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -> Array:
@@ -89,8 +93,3 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
     problem.close()
     parameters: Array = theta[0]
     return parameters
-
-
-PLAIN, EXTENDED = "plain", "extended"
-"""Names of the simulators in which tuners are compared: the original and the extended one."""
-MODEL_LABELS = (PLAIN, EXTENDED)

@@ -65,14 +65,14 @@ def draw_figures(
         Figures by name.
     """
     # `place` is the position of a tuner on the axis of tuners of its study.
-    places = {
-        (study.experiment.name, tuner): place
+    positions = {
+        (study.experiment.name, tuner): position
         for study in studies
-        for place, tuner in enumerate(study.list_tuners())
+        for position, tuner in enumerate(study.list_tuners())
     }
     table = frames["table"]
     keys = zip(table["experiment"], table["tuner"], strict=True)
-    table = table.assign(place=[places[key] for key in keys])
+    table = table.assign(place=[positions[key] for key in keys])
     counts = [len(study.list_targets()) for study in studies]
     count_range = dict.fromkeys((min(counts), max(counts)))  # one number if both are equal
     targets = f"{' to '.join(map(str, count_range))} targets"

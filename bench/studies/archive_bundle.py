@@ -90,8 +90,8 @@ def write_archive(
     if archive.exists():
         raise InputError(f"{archive}: exists already; name another file with --out")
     file_entries = [
-        {"path": path, "bytes": place.stat().st_size, "sha256": compute_sha256(place)}
-        for path, place in sorted(files.items())
+        {"path": path, "bytes": file.stat().st_size, "sha256": compute_sha256(file)}
+        for path, file in sorted(files.items())
     ]
     manifest = json.dumps({**metadata, "files": file_entries}, indent=1, ensure_ascii=False) + "\n"
     try:
@@ -100,9 +100,9 @@ def write_archive(
             packed.writestr(
                 _make_zip_header(f"{name}/{MANIFEST_FILE}"), manifest, zipfile.ZIP_DEFLATED, 9
             )
-            for path, place in sorted(files.items()):
+            for path, file in sorted(files.items()):
                 with (
-                    place.open("rb") as source,
+                    file.open("rb") as source,
                     packed.open(_make_zip_header(f"{name}/{path}"), "w") as target,
                 ):
                     shutil.copyfileobj(source, target, _BLOCK_BYTES)
@@ -240,8 +240,9 @@ def _find_top_folder(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
     """
     paths = {entry.filename for entry in entries}
     top_folders = {path.partition("/")[0] for path in paths}
-    for top_folder in top_folders:
-        if len(top_folders) == 1 and f"{top_folder}/{MANIFEST_FILE}" in paths:
+    if len(top_folders) == 1:
+        (top_folder,) = top_folders
+        if f"{top_folder}/{MANIFEST_FILE}" in paths:
             return top_folder
     raise InputError(
         f"{archive}: expected an archive of simgap bundle: one folder with {MANIFEST_FILE} in it"

@@ -48,8 +48,8 @@ def begin_studies(
     from bench.benchmark.problem.experiment import expand_sweep
     from bench.benchmark.runner.study_base import prepare_study
 
-    def begin(part: Experiment, place: Path | None) -> Study:
-        return get_study_class(part).begin(prepare_study(part, plugins, place, jobs, salt))
+    def begin(part: Experiment, study_folder: Path | None) -> Study:
+        return get_study_class(part).begin(prepare_study(part, plugins, study_folder, jobs, salt))
 
     experiments = expand_sweep(experiment)
     if len(experiments) == 1:

@@ -251,8 +251,7 @@ class ComparisonCollection:
     def styles(self) -> dict[str, MarkStyle]:
         """Style of each tuner, in the order of their mean ranks, the best first."""
         order = self.mean_ranks.mean().sort_values(kind="stable").index
-        places = {name: place for place, name in enumerate(self.tuners)}
-        return {str(name): get_mark_style(places[str(name)]) for name in order}
+        return {str(name): get_mark_style(self.tuners.index(str(name))) for name in order}
 
     def make_runtime_panel(self) -> tuple[Panel, pd.DataFrame]:
         """Make the panel of runtime distributions over all problems, with its table."""

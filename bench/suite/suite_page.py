@@ -169,7 +169,7 @@ def render_suite_page(tables: SuiteTables) -> str:
     shown_frames = {name: frame for name, frame in frames.items() if len(frame)}
     page.add_tables(shown_frames)
     order = _order_tuners(tables)
-    styles = {name: get_mark_style(place) for place, name in enumerate(order)}
+    styles = {name: get_mark_style(index) for index, name in enumerate(order)}
     targets = suite.runs.groupby("cell")["target"].nunique()
     seed_counts = suite.runs.groupby(["cell", "tuner", "target"])["seed"].nunique()
     seeds = int(seed_counts.max())

@@ -458,8 +458,8 @@ def find_stored_runs(version: str) -> SuiteRuns | None:
     Args:
         version: Version of the suite, which changes when its problems change.
     """
-    for place in REFERENCE_FOLDERS:
-        folder = place / _REFERENCE_NAME
+    for parent in REFERENCE_FOLDERS:
+        folder = parent / _REFERENCE_NAME
         if (folder / CURVES_FILE).is_file():
             stored = read_suite_runs(folder)
             if stored.version == version:

@@ -112,13 +112,18 @@ THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_TH
 """Environment variables that set the number of threads of numerical libraries."""
 
 
+def set_default_thread_count() -> None:
+    """Make numerical libraries that are loaded later use one thread, unless the user has set it."""
+    for name in THREAD_COUNT_VARIABLES:
+        os.environ.setdefault(name, "1")
+
+
 @contextmanager
 def limit_to_one_thread() -> Iterator[None]:
     """Limit numerical libraries to one thread within the block, as in a worker."""
     from threadpoolctl import threadpool_limits
 
     # The variables are for libraries loaded within the block; threadpoolctl limits loaded ones.
-    for name in THREAD_COUNT_VARIABLES:
-        os.environ.setdefault(name, "1")
+    set_default_thread_count()
     with threadpool_limits(limits=1):
         yield

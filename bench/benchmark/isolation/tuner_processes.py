@@ -282,14 +282,14 @@ class TunerSpec:
         }
 
 
-def relocate(tuned: TunerSpec, places: Mapping[Path, Path]) -> TunerSpec:
+def relocate(tuned: TunerSpec, new_paths: Mapping[Path, Path]) -> TunerSpec:
     """Return a specification with another path of its plugin file, if it has one.
 
     Args:
         tuned: specification of a tuner.
-        places: new path of each file by its present path.
+        new_paths: new path of each file by its present path.
     """
-    return replace(tuned, file=str(places[Path(tuned.file)])) if tuned.file else tuned
+    return replace(tuned, file=str(new_paths[Path(tuned.file)])) if tuned.file else tuned
 
 
 class IsolatedTuner:

@@ -57,11 +57,11 @@ class Transferable(Protocol):
         """Return the paths of the files, which must have different names."""
         ...
 
-    def relocate(self, places: Mapping[Path, Path]) -> Transferable:
+    def relocate(self, new_paths: Mapping[Path, Path]) -> Transferable:
         """Return a copy that refers to other paths.
 
         Args:
-            places: new path of each file by its present path.
+            new_paths: new path of each file by its present path.
         """
         ...
 
@@ -346,9 +346,11 @@ def run_on_worker(
     if paths:
         # All files are in one folder, because a recording's description must be next to its table.
         folder_here = _write_hashed_folder(tuple(contents))
-        places = {path: folder_here / name for path, (name, _) in zip(paths, contents, strict=True)}
+        new_paths = {
+            path: folder_here / name for path, (name, _) in zip(paths, contents, strict=True)
+        }
         arguments = tuple(
-            argument.relocate(places) if isinstance(argument, Transferable) else argument
+            argument.relocate(new_paths) if isinstance(argument, Transferable) else argument
             for argument in arguments
         )
     key = (threading.get_ident(), repr(plugins))

@@ -191,10 +191,10 @@ def make_unreachable_error(kind: str, name: str, part: type) -> InputError:
     """
     file = getattr(sys.modules.get(part.__module__), "__file__", None)
     is_main = part.__module__ == "__main__"
-    place = str(Path(file).resolve()) if file else "this session"
-    source = f"the script {place}" if file and is_main else place
+    path = str(Path(file).resolve()) if file else "this session"
+    source = f"the script {path}" if file and is_main else path
     must_move = is_main or not file
-    plugin = f"{name}.py" if must_move else place
+    plugin = f"{name}.py" if must_move else path
     move = f"put it into a file of its own, say {plugin}, and " if must_move else ""
     name_argument = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
     return InputError(

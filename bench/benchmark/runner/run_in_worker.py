@@ -72,14 +72,14 @@ class RunRequest:
         plugin = Path(self.tuned.file) if self.tuned and self.tuned.file else None
         return tuple(path for path in (self.weights, plugin) if path is not None)
 
-    def relocate(self, places: Mapping[Path, Path]) -> RunRequest:
+    def relocate(self, new_paths: Mapping[Path, Path]) -> RunRequest:
         """Return the request with other paths of its files.
 
         Args:
-            places: new path of each file by its present path.
+            new_paths: new path of each file by its present path.
         """
-        weights = None if self.weights is None else places[self.weights]
-        tuned = None if self.tuned is None else relocate(self.tuned, places)
+        weights = None if self.weights is None else new_paths[self.weights]
+        tuned = None if self.tuned is None else relocate(self.tuned, new_paths)
         return replace(self, weights=weights, tuned=tuned)
 
 

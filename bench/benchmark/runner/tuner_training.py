@@ -295,13 +295,13 @@ class TrainingRequest:
         """Return the files that another machine needs for the training."""
         return (Path(self.tuned.file),) if self.tuned and self.tuned.file else ()
 
-    def relocate(self, places: Mapping[Path, Path]) -> TrainingRequest:
+    def relocate(self, new_paths: Mapping[Path, Path]) -> TrainingRequest:
         """Return the request with other paths of its files.
 
         Args:
-            places: new path of each file by its present path.
+            new_paths: new path of each file by its present path.
         """
-        return self if self.tuned is None else replace(self, tuned=relocate(self.tuned, places))
+        return self if self.tuned is None else replace(self, tuned=relocate(self.tuned, new_paths))
 
 
 def train_or_load(

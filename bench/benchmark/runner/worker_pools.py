@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from bench.benchmark.isolation.linux_syscalls import set_not_dumpable
 from bench.benchmark.isolation.process_errors import describe_exit
-from bench.benchmark.isolation.resource_limits import THREAD_COUNT_VARIABLES, limit_to_one_thread
+from bench.benchmark.isolation.resource_limits import limit_to_one_thread, set_default_thread_count
 from sims.core.simulator import InputError
 from sims.engines.engine_lookup import describe_stepping
 
@@ -340,8 +340,7 @@ class LocalPool:
             jobs: number of worker processes.
         """
         # Workers inherit the variables; numerical libraries read them when they are loaded.
-        for name in THREAD_COUNT_VARIABLES:
-            os.environ.setdefault(name, "1")
+        set_default_thread_count()
         self._jobs = jobs
         self._plugins: list[Plugin] = []
         self._slots: list[_WorkerSlot] = []

@@ -80,8 +80,8 @@ class CsvTable:
             row: Row, or None for the file.
             problem: What is wrong.
         """
-        place = "" if row is None else f", line {self._get_line_number(row)}"
-        return InputError(f"{self._path}{place}: {problem}; {self._remedy}")
+        line = "" if row is None else f", line {self._get_line_number(row)}"
+        return InputError(f"{self._path}{line}: {problem}; {self._remedy}")
 
     def _read_text(self) -> str:
         """Read the file as text, without the byte order mark that Excel writes at the beginning.
@@ -194,8 +194,8 @@ class RunsTable(NamedTuple):
             row: Row, or None for the file.
             problem: What is wrong.
         """
-        place = "" if row is None else f", row {self.first_row + row}"
-        return InputError(f"{self.path}{place}: {problem}; {self.remedy}")
+        row_text = "" if row is None else f", row {self.first_row + row}"
+        return InputError(f"{self.path}{row_text}: {problem}; {self.remedy}")
 
     def read_runs(self, experiment: Experiment) -> pd.DataFrame:
         """Check all rows, and return one line per run, in the order of the file.

@@ -201,7 +201,8 @@ def find_reference(name: str) -> ReferenceResult:
 
 
 def _find_reference_folder(name: str) -> Path:
-    return next(place / name for place in REFERENCE_FOLDERS if (place / name / _TABLE).is_file())
+    folders = [parent / name for parent in REFERENCE_FOLDERS]
+    return next(folder for folder in folders if (folder / _TABLE).is_file())
 
 
 def _read_reference(name: str, folder: Path) -> ReferenceResult:

@@ -65,8 +65,8 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
     import pandas as pd
 
     def make_line_error(row: int | None, problem: str) -> InputError:
-        place = "" if row is None else f", line {row + 1}"
-        return InputError(f"{path}{place}: {problem}; {remedy}")
+        line = "" if row is None else f", line {row + 1}"
+        return InputError(f"{path}{line}: {problem}; {remedy}")
 
     planned_runs = []
     for row, name in enumerate(plan):

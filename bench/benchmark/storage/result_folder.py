@@ -1,8 +1,4 @@
-"""Folder of a comparison: configuration, versions, machine, and statuses of runs.
-
-While runs are missing, the salt is in a separate file that only its owner can read; when the study
-is complete, it is in experiment.toml.
-"""
+"""Folder of a comparison: configuration, versions, machine, and statuses of runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Secret salt of a study: draw it, commit to it by its hash, and reveal it when all is complete."""
+"""Secret salt of a study: draw it, commit to it by its hash, and reveal it when all is complete.
+
+While runs are missing, the salt is in a separate file that only its owner can read; when the study
+is complete, it is in experiment.toml.
+"""
 
 from __future__ import annotations
 
