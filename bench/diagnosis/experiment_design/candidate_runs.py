@@ -114,30 +114,7 @@ class RigModel:
             name for name in self.recorded_scenario.inputs if self.largest_commands[name] > 0
         )
         self.limits = read_model_file_limits(evaluator)
-        self.initial_state = self._get_initial_state()
-
-    def _get_initial_state(self) -> Array:
-        """Return the initial state of the first run, at rest and within joint ranges.
-
-        A robot cannot be started in motion.
-        """
-        states = self.evaluator.prepared_runs[0].initial_state_guess.copy()
-        rates = set(self.evaluator.simulator.system.rates)
-        for index, name in enumerate(self.evaluator.state_names):
-            if name in rates:
-                states[index] = 0.0
-            else:
-                states[index] = self._clip_to_joint_range(name, float(states[index]))
-        return states
-
-    def _clip_to_joint_range(self, name: str, value: float) -> float:
-        """Clip a state to the range of its joint.
-
-        Args:
-            name: name of the state, such as ``q.elbow``.
-            value: value in rad or m.
-        """
-        return float(np.clip(value, *self.limits.positions.get(name, UNLIMITED)))
+        self.initial_state = _get_rest_state(evaluator, self.limits)
 
     # -- plans
 
@@ -205,7 +182,7 @@ class RigModel:
             scale = usual_value if abs(usual_value) > REST_STATE else 1.0
             # Outside its range a joint begins at the limit, which is tried only once.
             yield from dict.fromkeys(
-                (name, self._clip_to_joint_range(name, scale * factor))
+                (name, float(_clip(scale * factor, self.limits.positions.get(name))))
                 for factor in INITIAL_STATE_FACTORS
             )
         # 2. Rates.
@@ -250,8 +227,8 @@ class RigModel:
         # 1. Medians.
         times = np.arange(0.0, self.seconds, self.step * plan.hold_factor)
         inputs = {
-            name: self._limit_command(name, np.full(times.size, self.median_commands[name]))
-            for name in self.recorded_scenario.inputs
+            name: _clip(np.full(times.size, median), self.limits.commands.get(name))
+            for name, median in self.median_commands.items()
         }
         initial_state = self.initial_state.copy()
         # 2. Signals of the driven inputs.
@@ -263,7 +240,7 @@ class RigModel:
             command = self.median_commands[name] + self.largest_commands[name] * (
                 signal + plan.level
             )
-            inputs[name] = self._limit_command(name, command)
+            inputs[name] = _clip(command, self.limits.commands.get(name))
             if (inputs[name] != command).any():
                 limited_inputs.append(name)
         # 3. Initial states and constants.
@@ -274,15 +251,6 @@ class RigModel:
         return CandidateRun(
             plan, self._describe_plan(plan, inputs, limited_inputs), scenario, initial_state
         )
-
-    def _limit_command(self, name: str, values: Array) -> Array:
-        """Clip a command to the limits of its actuator and its joint.
-
-        Args:
-            name: name of the input.
-            values: (T,) command in the unit of the input.
-        """
-        return np.asarray(np.clip(values, *self.limits.commands.get(name, UNLIMITED)))
 
     def _describe_plan(
         self, plan: RunPlan, inputs: Mapping[str, Array], limited_inputs: Sequence[str]
@@ -419,18 +387,33 @@ def _get_first_run(evaluator: RunEvaluator, limits: StatedLimits) -> ChangedRun:
     run_data = evaluator.prepared_runs[0]
     if not evaluator.kind.has_model:
         return ChangedRun("", {}, run_data.scenario, run_data.initial_state_guess)
-    rates = set(evaluator.simulator.system.rates)
-    states = [
-        0.0 if name in rates else _clip(value, limits.states.get(name))
-        for name, value in zip(evaluator.state_names, run_data.initial_state_guess, strict=True)
-    ]
     recorded_inputs = run_data.scenario.inputs
     inputs = {
         name: _clip(values, limits.commands.get(name)) for name, values in recorded_inputs.items()
     }
     is_limited = any((inputs[name] != values).any() for name, values in recorded_inputs.items())
     limit_note = ", with commands limited as the model file states" if is_limited else ""
-    return ChangedRun(limit_note, {}, replace(run_data.scenario, inputs=inputs), np.array(states))
+    scenario = replace(run_data.scenario, inputs=inputs)
+    return ChangedRun(limit_note, {}, scenario, _get_rest_state(evaluator, limits))
+
+
+def _get_rest_state(evaluator: RunEvaluator, limits: StatedLimits) -> Array:
+    """Return the initial state of the first run, at rest and within joint ranges.
+
+    A robot cannot be started in motion.
+
+    Args:
+        evaluator: run evaluator of the runs to which models are fitted.
+        limits: limits of the model file; empty for a system.
+    """
+    rates = set(evaluator.simulator.system.rates)
+    guess = evaluator.prepared_runs[0].initial_state_guess
+    return np.array(
+        [
+            0.0 if name in rates else _clip(value, limits.positions.get(name))
+            for name, value in zip(evaluator.state_names, guess, strict=True)
+        ]
+    )
 
 
 def _clip(values: Any, limits: Interval | None) -> Any:

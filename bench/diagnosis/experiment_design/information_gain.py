@@ -431,10 +431,14 @@ def _compute_parameter_information(models: ModelSet, model: FittedModel) -> _Par
     return _ParameterInformation(model, np.asarray(spread), inverse)
 
 
+def symmetrise_discrimination(values: Array) -> Array:
+    """Return the smaller discrimination of each pair, as either model of it may be true."""
+    return np.minimum(values, values.T)
+
+
 def _sum_discrimination(values: Array) -> float:
     """Sum the discrimination over all pairs; each pair counts up to `MAX_USEFUL_DISCRIMINATION`."""
-    # Either model of a pair may be true, so the smaller discrimination counts.
-    discrimination = np.minimum(values, values.T)
+    discrimination = symmetrise_discrimination(values)
     pairs = discrimination[np.triu_indices(len(discrimination), 1)]
     return float(np.minimum(pairs, MAX_USEFUL_DISCRIMINATION).sum())
 

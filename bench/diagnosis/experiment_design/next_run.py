@@ -11,14 +11,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
-
 from bench.diagnosis.experiment_design.candidate_runs import RigModel
 from bench.diagnosis.experiment_design.information_gain import (
     DISCRIMINATION_THRESHOLD,
     RunRanker,
     RunValue,
     get_sort_key,
+    symmetrise_discrimination,
 )
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from sims.core.simulator import Array
@@ -167,8 +166,7 @@ def _may_longer_run_help(best: RunValue, length_factor: float) -> bool:
     has_pairs = best.values.ndim == 2
     if length_factor <= 1.0 or not has_pairs:
         return False
-    # Either model of a pair may be true, so the smaller discrimination counts.
-    discrimination = np.minimum(best.values, best.values.T)
+    discrimination = symmetrise_discrimination(best.values)
     undistinguished = discrimination[
         (discrimination > 0) & (discrimination <= DISCRIMINATION_THRESHOLD)
     ]
@@ -224,8 +222,7 @@ def _describe_best_run(
     discrimination: dict[str, float] = {}
     groups: tuple[tuple[str, ...], ...] = ()
     if competing_models:
-        # Either model of a pair may be true, so the smaller discrimination counts.
-        pair_discrimination = np.minimum(run_value.values, run_value.values.T)
+        pair_discrimination = symmetrise_discrimination(run_value.values)
         effect = _list_other_effects(diagnosed_model, competing_models[0])
         names = [_list_other_effects(model, diagnosed_model) for model in competing_models]
         # The first row has the pairs with the diagnosed model.
