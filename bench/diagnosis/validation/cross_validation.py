@@ -14,13 +14,13 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.validation.held_out_runs import (
     HeldOutFit,
     HeldOutRuns,
+    Validation,
     compute_penalised_likelihood,
 )
 from sims.core.simulator import Array
@@ -33,25 +33,15 @@ an effect to be supported by these runs.
 """
 
 
-class CrossValidation:
+class CrossValidation(Validation):
     """Validation that predicts each run with models that are refitted to the other runs.
 
     Args:
         evaluator: Run evaluator of all runs; each run has the number of its fold.
         noise: Noise that weights the channels.
-
-    Attributes:
-        evaluator: Run evaluator of all runs.
-        noise: Noise that weights the channels.
-        seen: (R, T, C) mask of the available samples.
     """
 
     is_cross_validation = True
-
-    def __init__(self, evaluator: RunEvaluator, noise: NoiseModel) -> None:
-        self.evaluator = evaluator
-        self.noise = noise
-        self.seen: Mask = np.isfinite(evaluator.observed)
 
     @property
     def simulations(self) -> int:

@@ -8,9 +8,9 @@ log-likelihood L is that of G. Schwarz (Ann. Stat. 6(2), 461, 1978, doi:10.1214/
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -66,10 +66,14 @@ class HeldOutFit:
     freedom: float = 0.0
 
 
-class Validation(Protocol):
-    """Protocol for the prediction of runs with models that were fitted to other runs.
+class Validation(ABC):
+    """Prediction of runs with models that were fitted to other runs.
 
-    The runs are held-out runs, or all runs in turn (`bench.diagnosis.validation.held_out_runs`).
+    The runs are held-out runs (`HeldOutRuns`), or all runs in turn (`CrossValidation`).
+
+    Args:
+        evaluator: Run evaluator of the predicted runs.
+        noise: Noise that weights the channels.
 
     Attributes:
         evaluator: Run evaluator of the predicted runs.
@@ -78,26 +82,28 @@ class Validation(Protocol):
         is_cross_validation: Whether the reported model is fitted to these runs too.
     """
 
-    evaluator: RunEvaluator
-    noise: NoiseModel
-    seen: Mask
     is_cross_validation: bool
 
+    def __init__(self, evaluator: RunEvaluator, noise: NoiseModel) -> None:
+        self.evaluator = evaluator
+        self.noise = noise
+        self.seen: Mask = np.isfinite(evaluator.observed)
+
     @property
+    @abstractmethod
     def simulations(self) -> int:
         """Number of simulations made for the validation alone."""
-        ...
 
+    @abstractmethod
     def validate(self, fits: Sequence[TrajectoryFit]) -> list[HeldOutFit]:
         """Predict the runs with each model, given by its fit to the runs for fitting."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Release the resources of the simulators."""
-        ...
 
 
-class HeldOutRuns:
+class HeldOutRuns(Validation):
     """Validation on held-out runs, of which only the initial states are fitted.
 
     Args:
@@ -106,11 +112,6 @@ class HeldOutRuns:
     """
 
     is_cross_validation = False
-
-    def __init__(self, evaluator: RunEvaluator, noise: NoiseModel) -> None:
-        self.evaluator = evaluator
-        self.noise = noise
-        self.seen: Mask = np.isfinite(evaluator.observed)
 
     @property
     def simulations(self) -> int:
