@@ -142,9 +142,8 @@ def _grade_library(
     Returns:
         Outcome, size of the largest matched set, and the same with equivalent effects counted once.
     """
-    if (
-        not sets or verdict_name == "unknown"
-    ):  # effects listed with the verdict "unknown" are not named
+    # Effects listed with the verdict "unknown" are not named.
+    if not sets or verdict_name == "unknown":
         return "unnamed", 0, 0
     exact_matches = _match_sets_to_effects(effects, sets, lambda effect, names: effect in names)
     equivalent_matches = _match_sets_to_effects(

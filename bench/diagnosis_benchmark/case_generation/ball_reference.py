@@ -80,10 +80,9 @@ class FlightDynamics:
         return ax, ay, az
 
 
-def _compute_quadratic_drag(
-    c: float, u: float, v: float, w: float, speed: float = 1.0
-) -> Acceleration:
-    return -c * speed * u, -c * speed * v, -c * speed * w
+def _compute_quadratic_drag(c: float, u: float, v: float, w: float) -> Acceleration:
+    factor = -c * sqrt(u * u + v * v + w * w)
+    return factor * u, factor * v, factor * w
 
 
 def _compute_wind_drag(
@@ -112,7 +111,7 @@ def _compute_wind_drag(
         w: upward velocity, m/s.
     """
     u, v = u - c[1], v - c[2]
-    return _compute_quadratic_drag(c[0], u, v, w, sqrt(u * u + v * v + w * w))
+    return _compute_quadratic_drag(c[0], u, v, w)
 
 
 def _compute_periodic_acceleration(
@@ -150,14 +149,12 @@ def _compute_layer_drag(
         w: upward velocity, m/s.
     """
     fade_in = 0.5 * (1 + tanh((z - c[1]) / LAYER_BLUR))
-    return _compute_quadratic_drag(c[0] * fade_in, u, v, w, sqrt(u * u + v * v + w * w))
+    return _compute_quadratic_drag(c[0] * fade_in, u, v, w)
 
 
 ACCELERATION_LAWS: dict[str, Callable[..., Acceleration]] = {
-    "drag.linear": lambda c, g, t, x, y, z, u, v, w: _compute_quadratic_drag(c[0], u, v, w),
-    "drag.quadratic": lambda c, g, t, x, y, z, u, v, w: _compute_quadratic_drag(
-        c[0], u, v, w, sqrt(u * u + v * v + w * w)
-    ),
+    "drag.linear": lambda c, g, t, x, y, z, u, v, w: (-c[0] * u, -c[0] * v, -c[0] * w),
+    "drag.quadratic": lambda c, g, t, x, y, z, u, v, w: _compute_quadratic_drag(c[0], u, v, w),
     "wind": _compute_wind_drag,
     "gravity.scale": lambda c, g, *s: (0.0, 0.0, -c[0] * g),
     "gravity.tilt": lambda c, g, *s: (c[0] * g, c[1] * g, 0.0),

@@ -291,8 +291,7 @@ def _compute_unexplained_size(
     if not np.isfinite(observed).all():
         return 0.0
     if kind == "foreign":
-        _, residual = refitted_residuals.find_best_effect(setting, observed)
-        return residual
+        return refitted_residuals.compute_smallest_residual(setting, observed)
     return min(
         refitted_residuals.compute_refitted_residual(setting, observed, name, coefficients)
         for name, coefficients in wrong_answers

@@ -313,8 +313,8 @@ def compute_refitted_residual(
     return min(fit(observed, guess).rms_residual for _, guess in guesses[:STARTS_PER_EFFECT])
 
 
-def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str, float]:
-    """Find the effect of the library that leaves the smallest residual.
+def compute_smallest_residual(setting: RecordingConditions, observed: Array) -> float:
+    """Compute the RMS residual that the best effect of the library leaves, in units of the noise.
 
     All effects are ranked by their residual to first order; only the most promising ones are
     refitted. Effects of the input are left out if nothing drives the system.
@@ -324,9 +324,6 @@ def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str
     Args:
         setting: recording conditions.
         observed: noise-free observations, (R, T, C).
-
-    Returns:
-        Name of the effect and RMS residual in units of the noise.
     """
     base_fit = NuisanceFitter(setting)(observed)
     usable = library.list_effects_for(SIMULATORS[setting.system].system)
@@ -338,14 +335,13 @@ def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str
     # By effect, the first-order residual of its best start, and the start.
     best_starts = {name: _rank_starts(setting, observed, name, base_fit)[0] for name in names}
     promising_names = sorted(names, key=lambda name: best_starts[name][0])[:MAX_REFITTED_EFFECTS]
-    residuals = {}
+    # An effect can be zero, so it never leaves more than the model without it.
+    residuals = [base_fit.rms_residual]
     for name in promising_names:
         _, theta = best_starts[name]
         refit = NuisanceFitter(setting, [name])(observed, theta, base_fit.starts)
-        residuals[name] = refit.rms_residual
-    best_name = min(residuals, key=lambda name: residuals[name])
-    # An effect can be zero, so it never leaves more than the model without it.
-    return best_name, min(residuals[best_name], base_fit.rms_residual)
+        residuals.append(refit.rms_residual)
+    return min(residuals)
 
 
 def _rank_starts(
