@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -255,16 +256,10 @@ def _make_gravity_term(
         sentences: comment for each range.
         robot: model of the robot.
     """
-    scale = [
-        number_range
-        for ranges in by_effect.pop("gravity.scale", {}).values()
-        for number_range in ranges
-    ]
-    tilt = [
-        number_range
-        for ranges in by_effect.pop("gravity.tilt", {}).values()
-        for number_range in ranges
-    ]
+    scale, tilt = (
+        list(chain.from_iterable(by_effect.pop(effect, {}).values()))
+        for effect in ("gravity.scale", "gravity.tilt")
+    )
     if not scale and not tilt:
         return
     gravity_in_file = np.asarray(robot.compiled.opt.gravity, dtype=float)

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.diagnosis.report.candidate_ranking import (
-    select_shown_candidates,
-)
+from bench.diagnosis.report.candidate_ranking import select_shown_candidates
 from bench.diagnosis.report.candidates_figure import draw_candidates_figure
 from bench.diagnosis.report.diagnosed_places import list_place_marks
 from bench.diagnosis.report.joint_figure import draw_run_figure
@@ -29,9 +27,7 @@ from bench.figures import figure_output
 from bench.figures.figure_output import FigureFiles
 from bench.figures.figure_settings import is_pdf_wanted
 from bench.figures.robot_figure import compute_joint_positions, draw_robot_figure
-from bench.figures.style import (
-    apply_settings,
-)
+from bench.figures.style import apply_settings
 from sims.core.simulator import InputError, make_unknown_name_error
 
 if TYPE_CHECKING:

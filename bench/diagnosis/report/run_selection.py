@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from bench.diagnosis.report.effect_and_unit_text import shorten_label
-from bench.diagnosis.report.report_data import (
-    DataSplit,
-    DiagnosisReportData,
-)
+from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from sims.core.simulator import Array
-
-if TYPE_CHECKING:
-    pass
 
 
 class RunView(NamedTuple):
