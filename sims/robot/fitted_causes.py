@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sims.core.effect import ALL_PLACES
 from sims.core.plain_values import append_unit
 from sims.core.simulator import Array
 from sims.extended_simulator import FittedValue
@@ -15,9 +16,6 @@ from sims.robot.integrator_settings import OPTION_EFFECTS, format_option
 
 if TYPE_CHECKING:
     from sims.robot.robot_model import RobotModel
-
-ALL_PLACES = "*"
-"""Place of an effect family, which acts at all places of its kind."""
 
 _COEFFICIENT_NAMES: Mapping[str, tuple[str, ...]] = {
     "joint.axis": ("x", "y", "z"),

@@ -246,6 +246,11 @@ class RobotModel:
         axes = (*POSITION_AXES, *ANGLES)
         return frozenset(f"{base}.{axis}" for base in self.recorded_bases for axis in axes)
 
+    @cached_property
+    def file_joints(self) -> tuple[Joint, ...]:
+        """Joints of the model file with one coordinate, without those that `series` adds."""
+        return tuple(j for j in self.joints if j.has_one_coordinate and j.name not in self.series)
+
     @property
     def name(self) -> str:
         """Name of the robot: the file name without its suffix."""

@@ -79,16 +79,11 @@ class JointAddresses:
                 the second joints of flexible drives.
             both: select the joints of the file, followed by those in series.
         """
-        file_joints = [
-            joint
-            for joint in robot.joints
-            if joint.has_one_coordinate and joint.name not in robot.series
-        ]
-        series_joints = [robot.joint(name) for name in robot.series]
+        series_joints = tuple(robot.joint(name) for name in robot.series)
         if both:
-            joints = [*file_joints, *series_joints]
+            joints = robot.file_joints + series_joints
         else:
-            joints = series_joints if series else file_joints
+            joints = series_joints if series else robot.file_joints
         self.positions: IndexArray = np.array([j.position for j in joints], dtype=np.intp)
         self.velocities: IndexArray = np.array([j.velocity for j in joints], dtype=np.intp)
 
@@ -134,14 +129,13 @@ def compile_batch_model(robot: RobotModel, derived: bool) -> Any:
     spec = make_batch_spec(robot) if derived else robot.spec.copy()
     # The compiled callback of effect forces finds its simulation by the user data.
     spec.nuserdata = max(spec.nuserdata, 1)
-    for joint in robot.joints:
-        if joint.has_one_coordinate and joint.name not in robot.series:
-            spec.add_sensor(
-                name=DRIVE_SENSOR_PREFIX + joint.name,
-                type=mujoco.mjtSensor.mjSENS_JOINTACTFRC,
-                objtype=mujoco.mjtObj.mjOBJ_JOINT,
-                objname=joint.name,
-            )
+    for joint in robot.file_joints:
+        spec.add_sensor(
+            name=DRIVE_SENSOR_PREFIX + joint.name,
+            type=mujoco.mjtSensor.mjSENS_JOINTACTFRC,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            objname=joint.name,
+        )
     return robot.compile(spec)
 
 
@@ -154,8 +148,7 @@ def find_drive_sensors(model: Any, robot: RobotModel) -> dict[str, int]:
     """
     return {
         joint.name: int(model.sensor(DRIVE_SENSOR_PREFIX + joint.name).adr[0])
-        for joint in robot.joints
-        if joint.has_one_coordinate and joint.name not in robot.series
+        for joint in robot.file_joints
     }
 
 

@@ -236,18 +236,20 @@ def _make_channel_place(name: str, unit: str, joints: Sequence[EffectPlace]) -> 
     """
     quantity, _, joint_name = name.partition(".")
     joint = next((place for place in joints if place.name == joint_name), None)
-    is_at_joint = joint is not None and quantity in ("q", "qd", "tau")
-    return EffectPlace(
+    place = EffectPlace(
         name=name,
-        kind=joint.kind if joint and is_at_joint else "hinge",
-        coordinate=joint.coordinate if joint and is_at_joint else None,
+        kind="hinge",
+        coordinate=None,
         signal=name,
         unit=unit,
-        size=joint.size if joint and is_at_joint else 1.0,
+        size=1.0,
         inertia=1.0,
         stated={},
         words=f"channel {name}",
     )
+    if joint is None or quantity not in ("q", "qd", "tau"):
+        return place
+    return place._replace(kind=joint.kind, coordinate=joint.coordinate, size=joint.size)
 
 
 def _compute_moving_mass(robot: RobotModel) -> float:
