@@ -20,6 +20,7 @@ from bench.diagnosis.evaluation.simulation_cache import SimulationCache
 from sims import effects as library
 from sims.core.effect import Effect, Input, Sensor, members_of
 from sims.core.simulator import Array, InputError, Parameter, Scenario, make_unknown_name_error
+from sims.effects.sensor_effects import needs_every_step
 from sims.engines.engine_lookup import HIDDEN_STATE_ENGINES
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
@@ -344,7 +345,7 @@ class RunEvaluator:
             indices = self.get_coefficient_indices(effect.name)
             if _shifts_sample_times(effect):
                 shifting_indices.extend(indices)
-            if effect.sharp or (isinstance(effect, Sensor) and effect.filters):
+            if effect.sharp or needs_every_step(effect):
                 fine_step_indices.extend(indices)
         # The type must be given, because an empty list would become an array of floats.
         return np.array(shifting_indices, dtype=np.intp), np.array(fine_step_indices, dtype=np.intp)

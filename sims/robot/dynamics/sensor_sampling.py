@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Sensor, Signal
 from sims.core.simulator import Array
-from sims.effects.sensor_effects import apply_sensor_effects
+from sims.effects.sensor_effects import apply_sensor_effects, needs_every_step
 from sims.engines.time_grid import is_active
 
 TIME_TOLERANCE_SHARE = 1e-6
@@ -138,7 +138,7 @@ def _iterate_filters(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp],
     Args:
         sensors: sensor effects with coefficients (K, L, 1); those that filter nothing are ignored.
     """
-    filters = tuple((e, c) for e, c in sensors if isinstance(e, Sensor) and e.filters)
+    filters = tuple((e, c) for e, c in sensors if needs_every_step(e))
     is_filtered = [is_active(c)[:, 0] for _, c in filters]
     batch_indices = np.flatnonzero(np.any(is_filtered, axis=0)) if filters else np.zeros(0, np.intp)
     if batch_indices.size:
