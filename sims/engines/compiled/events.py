@@ -13,13 +13,6 @@ Its root is computed in the form without cancellation (W. H. Press et al., Numer
 edition, 2007, section 5.6):
 
     s = (r + w) / (2 b) = 2 p / (w - r),    w = sqrt(r^2 + 4 b p)          (9)
-
-With distance d to the event after the second attempt, its rate r and its acceleration a, the event
-is
-
-    s = -d / r (1 + d a / (2 r^2))                                         (10)
-
-seconds away, which solves d + r s + a s^2 / 2 = 0 up to terms of third order in d.
 """
 
 from __future__ import annotations

@@ -1,6 +1,12 @@
 """Impacts of the elements of a block with the ground, and the end of their bouncing.
 
-Equations (1) to (4) are those of `sims.engines.ground_contact`, (10) is that of `events`.
+Equations of impacts are those of `sims.engines.ground_contact`. After the step to the time of an
+impact that `events` estimates, with the height d above the ground, its rate r and its acceleration
+a, the impact is
+
+    s = -d / r (1 + d a / (2 r^2))                                         (10)
+
+seconds away, which solves d + r s + a s^2 / 2 = 0 up to terms of third order in d.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Forces of effects on a batch of robots in every step.
+"""Program on registers that computes the forces of effects on a batch of robots in every step.
 
-With NumPy, each effect is evaluated separately, which takes longer than MuJoCo's step. So the
-computation of all effects is one program on registers with one column for each batch element, as
-for the systems of `sims.engines.compiled`. Effects that cannot be traced are evaluated with NumPy.
+With NumPy (`effect_forces`), each effect is evaluated separately, which takes longer than MuJoCo's
+step. So the computation of all effects is one program on registers with one column for each batch
+element, as for the systems of `sims.engines.compiled`. Effects that cannot be traced are evaluated
+with NumPy.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Forces of the effects on a batch of a robot, precomputed or in every step."""
+"""Evaluate effects on a batch of robots: forces, limits of dry friction and hidden states."""
 
 from __future__ import annotations
 
