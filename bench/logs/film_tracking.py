@@ -32,7 +32,7 @@ class TrackingResult(NamedTuple):
     Attributes:
         notes: Notes for the user, to be shown first.
         frames: Number of recorded frames.
-        seen: Number of these frames that show the ball.
+        frames_with_ball: Number of these frames that show the ball.
         scale_method: Method by which heights in metres were found.
         noise_pixels: 1 sigma of one sample in pixels.
         noise: 1 sigma of a height in metres.
@@ -41,7 +41,7 @@ class TrackingResult(NamedTuple):
 
     notes: tuple[str, ...]
     frames: int
-    seen: int
+    frames_with_ball: int
     scale_method: str
     noise_pixels: float
     noise: float
@@ -51,7 +51,7 @@ class TrackingResult(NamedTuple):
         """Return the result as a JSON document, as `simgap track --json` prints it."""
         return {
             "frames": self.frames,
-            "frames_with_ball": self.seen,
+            "frames_with_ball": self.frames_with_ball,
             "metres_from": self.scale_method,
             "noise_pixels": self.noise_pixels,
             "noise_metres": self.noise,

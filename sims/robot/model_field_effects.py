@@ -113,7 +113,7 @@ def compute_factor(c: Any) -> Any:
     return np.maximum(1.0 + c, MIN_FACTOR)
 
 
-def gain_pulls(robot: RobotModel, number: int, term: int) -> bool:
+def is_control_set_point(robot: RobotModel, number: int, term: int) -> bool:
     """Return whether an actuator's control is a set point of its position or its velocity.
 
     The actuator's force is gain * control + b_0 + b_1 * position + b_2 * velocity. The control is
@@ -180,7 +180,7 @@ def _make_servo_gain_finder(term: int) -> Find:
         """Return the fields with the same gain of the actuator `place`: gain (if any), and bias."""
         actuator_id = robot.actuator(place).id
         servo_fields = [ModelField("actuator_biasprm", (actuator_id, term), -1)]
-        if gain_pulls(robot, actuator_id, term):
+        if is_control_set_point(robot, actuator_id, term):
             servo_fields.insert(0, ModelField("actuator_gainprm", (actuator_id, 0)))
         return [servo_fields]
 

@@ -34,14 +34,14 @@ class CompileRepairs:
 
     Attributes:
         files: reader of the model file and its assets.
-        left: omitted shapes.
+        omitted: omitted shapes and textures.
         balanced: bodies whose principal moments were changed, with the values before and after.
         massless: bodies that were given a mass, by whether other bodies are attached to them.
         slight: bodies that were given moments of inertia.
     """
 
     files: ModelFileReader
-    left: OmittedShapes
+    omitted: OmittedShapes
     balanced: list[str] = field(default_factory=list)
     massless: dict[bool, list[str]] = field(default_factory=dict)
     slight: list[str] = field(default_factory=list)
@@ -110,7 +110,7 @@ class CompileRepairs:
             if not assets and MESH_ERROR_PATTERN.search(reason):
                 assets = [mesh for mesh in spec.meshes if mesh.name == name]
         for asset in assets:
-            remove_asset(spec, asset, reason, self.left)
+            remove_asset(spec, asset, reason, self.omitted)
         return bool(assets)
 
     def _repair_triangle_inequality(self, spec: Any) -> bool:
@@ -166,7 +166,7 @@ class CompileRepairs:
     @property
     def notes(self) -> list[str]:
         """Notes about omitted shapes, and one note for each kind of repair of bodies."""
-        notes = self.left.notes
+        notes = self.omitted.notes
         if self.balanced:
             notes.append(
                 "no body has principal moments A + B < C; the nearest are taken (kg·m²): "

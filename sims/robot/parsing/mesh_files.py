@@ -29,13 +29,13 @@ class MeshLookup:
     Attributes:
         files: reader of the model file and its assets.
         folder: mesh folder given to MuJoCo, relative to the model file or absolute.
-        left: names of omitted meshes, by reason.
+        omitted: names of omitted meshes, by reason.
         found: paths of the meshes found, relative to the model file's folder, by name in the URDF.
     """
 
     files: ModelFileReader
     folder: str = ""
-    left: dict[str, list[str]] = field(default_factory=dict)
+    omitted: dict[str, list[str]] = field(default_factory=dict)
     found: dict[str, str] = field(default_factory=dict)
 
     def find(self, name: str) -> tuple[str | None, str]:
@@ -103,7 +103,7 @@ class MeshLookup:
             name: file name or URI in the URDF.
             reason: why the mesh cannot be read.
         """
-        self.left.setdefault(reason, []).append(PurePosixPath(name).name)
+        self.omitted.setdefault(reason, []).append(PurePosixPath(name).name)
 
     @property
     def notes(self) -> list[str]:
@@ -111,7 +111,7 @@ class MeshLookup:
         return [
             f"shapes left out, and their contacts, since their mesh {reason}: "
             f"{format_name_list(names)}"
-            for reason, names in self.left.items()
+            for reason, names in self.omitted.items()
         ]
 
 
@@ -121,19 +121,19 @@ class OmittedShapes:
 
     Attributes:
         source: beginning of error messages.
-        touching: files or names of omitted shapes that could have touched others, by reason.
-        seen: files or names of omitted elements that are only visual, by reason.
+        colliding: files or names of omitted shapes that could have touched others, by reason.
+        visual: files or names of omitted elements that are only visual, by reason.
     """
 
     source: str
-    touching: dict[str, list[str]] = field(default_factory=dict)
-    seen: dict[str, list[str]] = field(default_factory=dict)
+    colliding: dict[str, list[str]] = field(default_factory=dict)
+    visual: dict[str, list[str]] = field(default_factory=dict)
 
     def leave_out(self, spec: Any, geom: Any, label: str, reason: str) -> None:
         """Remove a geom (shape) whose file cannot be used, and record it for a note to the user.
 
-        Shapes that could have touched others are recorded in `touching`, those that are only visual
-        in `seen`.
+        Shapes that could have touched others are recorded in `colliding`, those that are only
+        visual in `visual`.
 
         Args:
             spec: editable model (`mujoco.MjSpec`); it is changed in place.
@@ -151,7 +151,7 @@ class OmittedShapes:
                 f"{truncate_text(body.name)} would follow from it; "
                 "repair the mesh, or state the body's <inertial>"
             )
-        group = self.touching if geom.contype or geom.conaffinity else self.seen
+        group = self.colliding if geom.contype or geom.conaffinity else self.visual
         group.setdefault(reason, []).append(label)
         spec.delete(geom)
 
@@ -161,9 +161,9 @@ class OmittedShapes:
         notes = [
             f"shapes left out, and their contacts, since their file {reason}: "
             f"{format_name_list(labels)}"
-            for reason, labels in self.touching.items()
+            for reason, labels in self.colliding.items()
         ]
-        for reason, labels in self.seen.items():
+        for reason, labels in self.visual.items():
             notes.append(
                 f"visual elements left out, since the file {reason}: {format_name_list(labels)}"
             )
@@ -258,10 +258,10 @@ def remove_asset(spec: Any, asset: Any, reason: str, omitted: OmittedShapes) -> 
         asset.file, asset.cubefiles = "", []
         asset.builtin = mujoco.mjtBuiltin.mjBUILTIN_FLAT
         asset.width = asset.height = 1
-        omitted.seen.setdefault(reason, []).append(label)
+        omitted.visual.setdefault(reason, []).append(label)
         return
     if isinstance(asset, mujoco.MjsSkin):
-        omitted.seen.setdefault(reason, []).append(label)
+        omitted.visual.setdefault(reason, []).append(label)
     else:
         attribute = "meshname" if isinstance(asset, mujoco.MjsMesh) else "hfieldname"
         for geom in [geom for geom in spec.geoms if getattr(geom, attribute) == asset.name]:
