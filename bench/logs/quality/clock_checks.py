@@ -39,7 +39,7 @@ import numpy as np
 
 from bench.logs.lost_samples import MAX_FILLED_SAMPLES, find_lost_samples
 from bench.logs.quality import pose_check
-from bench.logs.quality.quality_finding import Anomaly, QualityFinding
+from bench.logs.quality.quality_finding import SIGNIFICANCE_SIGMAS, Anomaly, QualityFinding
 from sims.core.plain_values import join_first_names
 from sims.core.simulator import Array, Simulator
 from sims.core.system import StateSnapshot, System
@@ -55,8 +55,6 @@ FAST_SIGNAL_STEPS = 5.0
 
 A signal that changes this fast does not repeat its value by coincidence.
 """
-SIGNIFICANCE_SIGMAS = 4.0
-"""Detection threshold in standard deviations."""
 UNEVEN_SHARE = 0.01
 """Relative difference from the median interval from which an interval counts as uneven."""
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+SIGNIFICANCE_SIGMAS = 4.0
+"""Detection threshold of the checks in standard deviations."""
+
 
 class QualityFinding(NamedTuple):
     """One finding of a quality check.

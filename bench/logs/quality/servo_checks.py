@@ -65,9 +65,9 @@ def check_servos(recording: Recording, kind: type[Simulator]) -> Iterator[Anomal
         for command, _ in servo_signals
         for _, position in servo_signals
     }
+    min_degree_slope, max_degree_slope = DEGREE_SLOPE_RANGE
     for command, position in servo_signals:
         slope, correlation = regressions[command, position]
-        min_degree_slope, max_degree_slope = DEGREE_SLOPE_RANGE
         is_following = correlation > MIN_FOLLOWING_CORRELATION
         if is_following and min_degree_slope < slope < max_degree_slope:
             ratio_text = f"{slope:.3g} times as far as {command} commands"

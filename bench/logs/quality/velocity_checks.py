@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.logs.quality.noise_estimation import estimate_noise
-from bench.logs.quality.quality_finding import QualityFinding
+from bench.logs.quality.quality_finding import SIGNIFICANCE_SIGMAS, QualityFinding
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run
@@ -33,8 +33,6 @@ MIN_CORRELATION = 0.8
 """Correlation below which a velocity is unrelated to its position."""
 DELAY_THRESHOLD_INTERVALS = 0.5
 """Smallest reported lag T of equation (2), in sampling intervals."""
-SIGNIFICANCE_SIGMAS = 4.0
-"""Detection threshold in standard deviations."""
 MIN_SEGMENT_SAMPLES = 5
 """Minimum number of samples in an interval of integration."""
 MIN_SEGMENTS = 10
