@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from bench.diagnosis.conventions.signal_changes import SignalChange, change_signals
-from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
+from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, DescribedSignal, Subject
 from bench.logs.importing.joint_order import find_best_order
 from bench.logs.importing.normalised_positions import compute_range_scale
 from sims.core.plain_values import join_first_names
@@ -446,7 +446,7 @@ def _find_order_of_commands(joints: Sequence[JointSignals], recording: Recording
 
 
 def _generate_units(
-    signals: Sequence[Signal], recording: Recording
+    signals: Sequence[DescribedSignal], recording: Recording
 ) -> Iterator[ConventionHypothesis]:
     """Yield hypotheses that some signals have another unit than the description states.
 
@@ -485,7 +485,7 @@ def _generate_units(
             )
 
 
-def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
+def _are_whole(signals: Sequence[DescribedSignal], recording: Recording) -> bool:
     """Return whether all recorded values of these signals are integers, as encoder ticks are.
 
     Integers indicate raw counts, whose unit the description may have wrong.

@@ -155,7 +155,7 @@ SAME_UNIT_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class Signal:
+class DescribedSignal:
     """Recorded channel or input.
 
     Attributes:
@@ -181,7 +181,7 @@ class Signal:
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class UnitHypothesis:
     """Hypothesis that the values of signals have another unit or sign than specified.
 
     Attributes:
@@ -190,7 +190,7 @@ class Hypothesis:
         scale: Factor of all signals, in addition to that of the units.
     """
 
-    signals: tuple[Signal, ...]
+    signals: tuple[DescribedSignal, ...]
     units: tuple[str, ...]
     scale: float = 1.0
 
@@ -228,7 +228,7 @@ class Hypothesis:
             error_after=after,
         )
 
-    def _get_corrected_scale(self, signal: Signal) -> float:
+    def _get_corrected_scale(self, signal: DescribedSignal) -> float:
         """Return the key `scale` of a signal's table, including a factor already specified."""
         return self.scale * signal.scale
 
@@ -289,7 +289,7 @@ class Subject:
         """Name of the description file."""
         return self.recording.path.with_suffix(".toml").name
 
-    def signals(self, channels: Sequence[str]) -> tuple[Signal, ...]:
+    def signals(self, channels: Sequence[str]) -> tuple[DescribedSignal, ...]:
         """Return the recorded signals with the units that the description states.
 
         They are the signals whose units may be wrong.
@@ -315,7 +315,9 @@ class Subject:
                         declared.name, (declared.unit, 1.0, 1.0)
                     )
                     signals.append(
-                        Signal(declared.name, kind, declared.unit, specified_unit, gain, scale)
+                        DescribedSignal(
+                            declared.name, kind, declared.unit, specified_unit, gain, scale
+                        )
                     )
         return tuple(signals)
 
@@ -373,7 +375,7 @@ def find_wrong_units(
     signals = subject.signals(evaluator.channels)
     hypotheses = list(_generate_hypotheses(signals, _list_suspected_parts(evaluator, shares)))
     max_excess = MAX_REMAINING_SHARE * (before - 1.0)
-    after_by_hypothesis: dict[Hypothesis, float] = {}
+    after_by_hypothesis: dict[UnitHypothesis, float] = {}
     alternative_texts: list[str] = []
     # 3. Fits. `after` is the RMS residual with the hypothesis, in units of the noise.
     for hypothesis in _select_promising(subject, hypotheses):
@@ -473,7 +475,7 @@ def find_imitated_unit(
     return None
 
 
-def _get_unit_gain(signal: Signal, unit: str) -> float:
+def _get_unit_gain(signal: DescribedSignal, unit: str) -> float:
     """Return the factor from the values of a signal to SI units, if the values have this unit.
 
     Args:
@@ -567,8 +569,8 @@ def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[s
 
 
 def _generate_hypotheses(
-    signals: Sequence[Signal], suspects: frozenset[str] | None
-) -> Iterator[Hypothesis]:
+    signals: Sequence[DescribedSignal], suspects: frozenset[str] | None
+) -> Iterator[UnitHypothesis]:
     """Yield all hypotheses about wrong units and signs.
 
     1. One signal has another unit.
@@ -584,7 +586,7 @@ def _generate_hypotheses(
     for signal in signals:
         if suspects is None or signal.name.partition(".")[2] in suspects:
             yield from _generate_unit_hypotheses((signal,))
-    by_unit: dict[tuple[str, str, str], list[Signal]] = {}
+    by_unit: dict[tuple[str, str, str], list[DescribedSignal]] = {}
     for signal in signals:
         by_unit.setdefault((signal.kind, signal.si, signal.specified_unit), []).append(signal)
     # 2. Common unit.
@@ -601,19 +603,21 @@ def _generate_hypotheses(
             )
             # A single quantity is case 2.
             if len({s.si for s in changed_signals}) > 1:
-                yield Hypothesis(
+                yield UnitHypothesis(
                     changed_signals, tuple(actual_units[s.si] for s in changed_signals)
                 )
         # If the log was converted from this system twice, all signals have the same wrong factor.
         if len({s.si for s in related_signals}) > 1:
             si = related_signals[0].si
             specified_units = tuple(s.specified_unit for s in related_signals)
-            yield Hypothesis(tuple(related_signals), specified_units, 1.0 / UNITS[si][units[si]])
+            yield UnitHypothesis(
+                tuple(related_signals), specified_units, 1.0 / UNITS[si][units[si]]
+            )
     # 4. Reversed joints.
     yield from _generate_reversed_joints(signals, suspects)
 
 
-def _generate_unit_hypotheses(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
+def _generate_unit_hypotheses(signals: tuple[DescribedSignal, ...]) -> Iterator[UnitHypothesis]:
     """Yield hypotheses that signals of one unit have another unit, a reversed sign, or both.
 
     Factors that undo a conversion that was made twice are tried as well, unless they equal that of
@@ -621,7 +625,7 @@ def _generate_unit_hypotheses(signals: tuple[Signal, ...]) -> Iterator[Hypothesi
     """
     first = signals[0]
     stated_units = (first.specified_unit,) * len(signals)
-    yield Hypothesis(signals, stated_units, -1.0)
+    yield UnitHypothesis(signals, stated_units, -1.0)
     units = UNITS.get(first.si, {})
     stated = abs(first.gain / first.scale)
     tested_factors = {1.0}
@@ -629,19 +633,19 @@ def _generate_unit_hypotheses(signals: tuple[Signal, ...]) -> Iterator[Hypothesi
         if unit != first.specified_unit and not math.isclose(
             gain, stated, rel_tol=SAME_UNIT_TOLERANCE
         ):
-            yield Hypothesis(signals, (unit,) * len(signals))
-            yield Hypothesis(signals, (unit,) * len(signals), -1.0)
+            yield UnitHypothesis(signals, (unit,) * len(signals))
+            yield UnitHypothesis(signals, (unit,) * len(signals), -1.0)
             tested_factors.add(gain / stated)
     double_conversions = [1.0 / gain for gain in units.values()] if units else [1e3, 1e-3]
     for factor in double_conversions:
         if not any(math.isclose(factor, known, rel_tol=GAIN_TOLERANCE) for known in tested_factors):
-            yield Hypothesis(signals, stated_units, factor)
-            yield Hypothesis(signals, stated_units, -factor)
+            yield UnitHypothesis(signals, stated_units, factor)
+            yield UnitHypothesis(signals, stated_units, -factor)
 
 
 def _generate_reversed_joints(
-    signals: Sequence[Signal], suspects: frozenset[str] | None
-) -> Iterator[Hypothesis]:
+    signals: Sequence[DescribedSignal], suspects: frozenset[str] | None
+) -> Iterator[UnitHypothesis]:
     """Yield hypotheses of joints with reversed direction: all their channels change sign.
 
     Only joints with several channels count; a single channel is tested as a single signal.
@@ -650,19 +654,21 @@ def _generate_reversed_joints(
         signals: recorded channels and inputs.
         suspects: names of the joints to check; None for all.
     """
-    joints: dict[str, list[Signal]] = {}
+    joints: dict[str, list[DescribedSignal]] = {}
     for signal in signals:
         quantity, _, joint = signal.name.partition(".")
         if signal.kind == "channels" and quantity in ("q", "qd", "tau"):
             joints.setdefault(joint, []).append(signal)
     for joint, joint_signals in joints.items():
         if len(joint_signals) > 1 and (suspects is None or joint in suspects):
-            yield Hypothesis(
+            yield UnitHypothesis(
                 tuple(joint_signals), tuple(s.specified_unit for s in joint_signals), -1.0
             )
 
 
-def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _select_promising(
+    subject: Subject, hypotheses: Sequence[UnitHypothesis]
+) -> list[UnitHypothesis]:
     """Select the hypotheses that are worth a fit, by their misfit without a fit.
 
     They are screened by the beginning of the runs, where wrong parameters matter least, and then by
@@ -673,7 +679,7 @@ def _select_promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> lis
         hypotheses: hypotheses to select from.
     """
 
-    def rank(hypotheses: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
+    def rank(hypotheses: Sequence[UnitHypothesis], share: float) -> list[UnitHypothesis]:
         """Sort hypotheses by their misfit in the first `share` of each run, smallest first.
 
         The recording is simulated with the starting values of the base fit; nothing is fitted here.
@@ -768,7 +774,7 @@ def _compute_max_cost(evaluator: RunEvaluator, noise: NoiseModel, max_rms: float
 
 
 def _test_distinctness(
-    subject: Subject, hypothesis: Hypothesis, after: float, samples: int
+    subject: Subject, hypothesis: UnitHypothesis, after: float, samples: int
 ) -> Literal["sharp", "absorbed", "none"]:
     """Test whether a hypothesis fits clearly better than nearby factors.
 

@@ -60,7 +60,7 @@ Bound = Literal["low", "high"]
 """End of a range that a value lies at."""
 
 
-def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[tuple[float, float]]:
+def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[Bounds]:
     """Return the range in which a fit may move each coefficient of an effect.
 
     The plausible range of a coefficient ranks causes, and values outside it are reported, but it
@@ -86,9 +86,7 @@ def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[tuple
     ]
 
 
-def get_bounds_by_index(
-    evaluator: RunEvaluator, names: Iterable[str]
-) -> dict[int, tuple[float, float]]:
+def get_bounds_by_index(evaluator: RunEvaluator, names: Iterable[str]) -> dict[int, Bounds]:
     """Return the range in which a fit may move each coefficient of some effects.
 
     Args:
@@ -98,7 +96,7 @@ def get_bounds_by_index(
     Returns:
         Lower and upper end of the range, by index of the coefficient in theta.
     """
-    bounds: dict[int, tuple[float, float]] = {}
+    bounds: dict[int, Bounds] = {}
     for name in names:
         indices = evaluator.get_coefficient_indices(name)
         bounds |= zip(indices, compute_coefficient_bounds(evaluator, name), strict=True)
@@ -148,9 +146,7 @@ def bound_of(value: float, low: float, high: float) -> Bound | None:
     return None
 
 
-def _restrict_to_physical(
-    bounds: tuple[float, float], coefficient: Coefficient
-) -> tuple[float, float]:
+def _restrict_to_physical(bounds: Bounds, coefficient: Coefficient) -> Bounds:
     """Return a range restricted to the physical limits of a coefficient.
 
     Args:
@@ -167,7 +163,7 @@ def _restrict_to_physical(
 
 def _compute_fit_bounds(
     parameter: Parameter, coefficient: Coefficient, effect: Effect, evaluator: RunEvaluator
-) -> tuple[float, float]:
+) -> Bounds:
     """Return the range in which a fit may move a coefficient, without its physical limits.
 
     It is the plausible range, widened by a factor, since data count more than plausibility. Times
@@ -216,7 +212,7 @@ def list_coefficients(evaluator: RunEvaluator, name: str) -> Sequence[Parameter]
     return evaluator.parameters[evaluator.coefficient_slices[name]]
 
 
-def compute_range_around(evaluator: RunEvaluator, place: int, value: float | None = None) -> Bounds:
+def compute_range_around(evaluator: RunEvaluator, index: int, value: float | None = None) -> Bounds:
     """Return the range of a base parameter, widened until it contains a value.
 
     It is widened at most `MAX_WIDENING_ROUNDS` times, and not beyond physical limits, so that it
@@ -224,11 +220,11 @@ def compute_range_around(evaluator: RunEvaluator, place: int, value: float | Non
 
     Args:
         evaluator: run evaluator of the runs to which models are fitted.
-        place: index of the parameter.
+        index: index of the parameter.
         value: value that the range should contain; None for the widest range.
     """
-    parameter = evaluator.parameters[place]
-    limits = get_physical_limits(evaluator, place)
+    parameter = evaluator.parameters[index]
+    limits = get_physical_limits(evaluator, index)
     for _ in range(MAX_WIDENING_ROUNDS):
         low, high = parameter.bounds
         if value is not None and low <= value <= high:
@@ -256,7 +252,7 @@ def use_bounds(evaluator: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> Non
     evaluator.worker_pool.forget(evaluator)
 
 
-def get_physical_limits(evaluator: RunEvaluator, place: int) -> Bounds:
+def get_physical_limits(evaluator: RunEvaluator, index: int) -> Bounds:
     """Return the physical limits of a base parameter; for a robot, those of its total value.
 
     For example, a mass cannot be negative. A robot's free number is fitted as an effect that
@@ -265,9 +261,9 @@ def get_physical_limits(evaluator: RunEvaluator, place: int) -> Bounds:
 
     Args:
         evaluator: run evaluator of the runs to which models are fitted.
-        place: index of the parameter.
+        index: index of the parameter.
     """
-    parameter = evaluator.parameters[place]
+    parameter = evaluator.parameters[index]
     coefficient = None
     if evaluator.kind.has_model:
         coefficient = _get_coefficient(evaluator.kind, parameter.name)

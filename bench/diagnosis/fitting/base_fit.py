@@ -185,25 +185,6 @@ def fit_base_model(
     return base.refit_at_nominal(evaluator, noise, insensitive) if insensitive else base
 
 
-def refit_without_step_error(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
-    """Return the base model of a robot, corrected for the discretisation error and fitted again.
-
-    The error of the integrator's steps would otherwise be explained by effects. It is estimated at
-    the fitted model; if it is too large to be corrected, the model is returned as it is.
-
-    Args:
-        evaluator: the runs of a robot; the correction is stored in it.
-        noise: noise of each channel.
-        base: fit of the base model, with the parameters that were fixed or freed.
-    """
-    # Imported here, because only robots need it.
-    from bench.diagnosis.evaluation.discretisation_error import correct_discretisation
-
-    correct_discretisation(evaluator, noise, base.fit.theta, base.fit.initial_states)
-    is_corrected = evaluator.discretisation_correction is not None
-    return base.refit(evaluator, noise) if is_corrected else base
-
-
 def _list_starts(evaluator: RunEvaluator, initial_base: Array | None) -> list[Array]:
     """Return parameter vectors (P,) from which the base model is fitted.
 

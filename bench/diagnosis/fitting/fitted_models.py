@@ -78,6 +78,11 @@ class FittedModel:
         return self.fit.effects
 
 
+def select_likeliest(*models: FittedModel) -> FittedModel:
+    """Return the model with the highest penalised log-likelihood; the first one of equal ones."""
+    return max(models, key=lambda model: model.penalised_log_likelihood)
+
+
 @dataclass
 class ModelSet:
     """Fitted models of one recording, by their effects.
@@ -411,7 +416,7 @@ class ModelSet:
         """
         fitted_models = self.models.values()
         models = [m for m in fitted_models if len(m.effects) == size]
-        return max(models, key=lambda m: m.penalised_log_likelihood) if models else None
+        return select_likeliest(*models) if models else None
 
     def compute_excess_residual(self, model: FittedModel) -> float:
         """Return the RMS residual of a model, in units of the noise floor, minus one.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, whiten
-from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
+from bench.diagnosis.evaluation.parameter_bounds import Bounds, get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import MIN_CHUNK_SIZE, Indices, RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import (
     MAX_DAMPING,
@@ -443,7 +443,7 @@ class TrajectoryFitter:
         """
         evaluator = self.evaluator
         # Bounds of the fitted parameters by index in theta: base parameters, then coefficients.
-        bounds: dict[int, tuple[float, float]] = {}
+        bounds: dict[int, Bounds] = {}
         if self.fits_parameters:
             base = [i for i in evaluator.base_indices.tolist() if i not in self.fixed_parameters]
             bounds = {i: evaluator.parameters[i].bounds for i in base}

@@ -44,15 +44,15 @@ class Columns:
 
     Attributes:
         probes: the K candidates.
-        places: (K,) index of the column of each candidate; candidates with the same effect share a
-            column.
+        column_indices: (K,) index of the column of each candidate, which those with the same effect
+            share.
         sizes: (K,) scaling coefficient of each probe.
         pushed: (R, T - 1, E + nu, M) mean forces and controls of M columns between samples.
         readings: ψ (R, T, C, M).
     """
 
     probes: tuple[CandidateDirection, ...]
-    places: IndexArray
+    column_indices: IndexArray
     sizes: Array
     pushed: SingleArray
     readings: SingleArray
@@ -61,7 +61,7 @@ class Columns:
         """Return the columns of these candidates, followed by those of others."""
         return Columns(
             self.probes + others.probes,
-            np.concatenate([self.places, others.places + self.pushed.shape[3]]),
+            np.concatenate([self.column_indices, others.column_indices + self.pushed.shape[3]]),
             np.concatenate([self.sizes, others.sizes]),
             np.concatenate([self.pushed, others.pushed], axis=3),
             np.concatenate([self.readings, others.readings], axis=3),
@@ -71,7 +71,12 @@ class Columns:
         """Return some of the candidates, with the columns of all."""
         indices = list(chosen)
         probes = tuple(self.probes[i] for i in indices)
-        return replace(self, probes=probes, places=self.places[indices], sizes=self.sizes[indices])
+        return replace(
+            self,
+            probes=probes,
+            column_indices=self.column_indices[indices],
+            sizes=self.sizes[indices],
+        )
 
     def total(self, chosen: Sequence[int], coefficients: Array) -> tuple[Array, Array]:
         """Return the sum of the inputs of the chosen candidates, each times its coefficient.
@@ -87,7 +92,7 @@ class Columns:
             Missing forces and changes of the controls (R, T - 1, E + nu), and changes ψ of the
             readings (R, T, C), of R runs with T samples, E forces, nu controls and C channels.
         """
-        columns = self.places[list(chosen)]
+        columns = self.column_indices[list(chosen)]
         weights = coefficients / self.sizes[list(chosen)]
         return self.pushed[..., columns] @ weights, self.readings[..., columns] @ weights
 
@@ -107,10 +112,8 @@ def compute_columns(followed: FollowedRuns, probes: Sequence[CandidateDirection]
     column_by_key: dict[tuple[str, bytes], int] = {}
     column_indices = []
     for probe in probes:
-        effect, coefficients = (
-            followed.evaluator.available_effects[probe.effect],
-            probe.coefficients,
-        )
+        effect = followed.evaluator.available_effects[probe.effect]
+        coefficients = probe.coefficients
         # Members of a family, each with its part of the coefficients.
         acting_members = [
             (member, part)
@@ -168,7 +171,7 @@ def compute_responses(followed: FollowedRuns, columns: Columns) -> SingleArray:
     result = np.empty((*whitened.shape[:3], sizes.size), dtype=np.float32)
     # One run at a time, because the arrays of all runs together exceed the CPU cache.
     for run, values in enumerate(result):
-        np.take(whitened[run], columns.places, axis=2, out=values, mode="clip")
+        np.take(whitened[run], columns.column_indices, axis=2, out=values, mode="clip")
         with np.errstate(all="ignore"):
             values /= sizes
             # A candidate with a divergent motion gets a response of zero.
@@ -177,7 +180,7 @@ def compute_responses(followed: FollowedRuns, columns: Columns) -> SingleArray:
 
 
 def compute_parameter_responses(
-    followed: FollowedRuns, places: Sequence[int], sizes: Array
+    followed: FollowedRuns, indices: Sequence[int], sizes: Array
 ) -> SingleArray:
     """Return how a change of each parameter changes the whitened innovations of the filter.
 
@@ -188,7 +191,7 @@ def compute_parameter_responses(
 
     Args:
         followed: the R runs, followed by the filter.
-        places: indices of n parameters in theta.
+        indices: indices of n parameters in theta.
         sizes: (n,) finite changes of the parameters.
 
     Returns:
@@ -197,13 +200,13 @@ def compute_parameter_responses(
     """
     run_count, samples, channels = followed.runs.residuals.shape
     pushed = np.zeros(
-        (run_count, samples - 1, followed.runs.prior.size, len(places)), dtype=np.float32
+        (run_count, samples - 1, followed.runs.prior.size, len(indices)), dtype=np.float32
     )
-    readings = np.zeros((run_count, samples, channels, len(places)), dtype=np.float32)
-    for column, (place, size) in enumerate(zip(places, sizes.tolist(), strict=True)):
+    readings = np.zeros((run_count, samples, channels, len(indices)), dtype=np.float32)
+    for column, (index, size) in enumerate(zip(indices, sizes.tolist(), strict=True)):
         followed.evaluator.search_control.check_not_stopped()
         theta = followed.theta.copy()
-        theta[place] += size
+        theta[index] += size
         for run, linear in enumerate(followed.linear):
             displaced = linearise_run(
                 *(followed.evaluator, theta, followed.noise, run, linear.trajectory, linear),
@@ -254,10 +257,12 @@ def compute_sensitivities(
             columns.readings[..., batch],
         )
         # Candidates whose columns are in this batch.
-        chosen = np.flatnonzero((columns.places >= begin) & (columns.places < batch.stop))
+        chosen = np.flatnonzero(
+            (columns.column_indices >= begin) & (columns.column_indices < batch.stop)
+        )
         with np.errstate(all="ignore"):
             result[..., chosen] = (
-                changes[..., columns.places[chosen] - begin] / columns.sizes[chosen]
+                changes[..., columns.column_indices[chosen] - begin] / columns.sizes[chosen]
             )
     return result
 

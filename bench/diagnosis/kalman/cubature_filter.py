@@ -78,7 +78,7 @@ class FirstStates(NamedTuple):
     deviations: Array
 
 
-class Hypothesis(NamedTuple):
+class FilterHypothesis(NamedTuple):
     """Assumption with which one run is filtered.
 
     Attributes:
@@ -154,7 +154,9 @@ def smooth_first_states(
     runs, share_count = range(len(evaluator.prepared_runs)), len(FORCE_SHARES)
     # The hypotheses of a run follow one another.
     results = filter_hypotheses(
-        evaluator, sigma, [Hypothesis(run, theta, share) for run in runs for share in FORCE_SHARES]
+        evaluator,
+        sigma,
+        [FilterHypothesis(run, theta, share) for run in runs for share in FORCE_SHARES],
     )
     best = [
         max(
@@ -243,7 +245,7 @@ def can_filter(evaluator: RunEvaluator, theta: Array) -> bool:
 
 
 def filter_hypotheses(
-    evaluator: RunEvaluator, sigma: Array, hypotheses: Sequence[Hypothesis]
+    evaluator: RunEvaluator, sigma: Array, hypotheses: Sequence[FilterHypothesis]
 ) -> list[SmoothedStart]:
     """Filter and smooth runs under several hypotheses, with as many as possible in one batch.
 
@@ -286,7 +288,7 @@ class _CubatureFilters:
     """Cubature filters of F hypotheses about runs with the same sample times."""
 
     def __init__(
-        self, evaluator: RunEvaluator, sigma: Array, hypotheses: Sequence[Hypothesis]
+        self, evaluator: RunEvaluator, sigma: Array, hypotheses: Sequence[FilterHypothesis]
     ) -> None:
         """Compute the inputs over all steps, and find the recorded components of the state.
 

@@ -38,21 +38,21 @@ class Information(NamedTuple):
     """Fisher information of parameters.
 
     Attributes:
-        places: indices of the n parameters in theta.
+        indices: indices of the n parameters in theta.
         matrix: (n, n) information.
     """
 
-    places: list[int]
+    indices: list[int]
     matrix: Array
 
-    def select(self, places: list[int]) -> Information:
+    def select(self, indices: list[int]) -> Information:
         """Return the information of some of the parameters if the others are known.
 
         Args:
-            places: indices of these parameters in theta.
+            indices: indices of these parameters in theta.
         """
-        rows = [self.places.index(i) for i in places]
-        return Information(places, self.matrix[np.ix_(rows, rows)])
+        rows = [self.indices.index(i) for i in indices]
+        return Information(indices, self.matrix[np.ix_(rows, rows)])
 
 
 def maximise_innovation_likelihood(
@@ -164,7 +164,7 @@ def compute_wald_statistics(
     statistics = {}
     for name in names:
         indices = evaluator.get_coefficient_indices(name)
-        rows = [information.places.index(i) for i in indices]
+        rows = [information.indices.index(i) for i in indices]
         inverse = np.linalg.pinv(covariance[np.ix_(rows, rows)], hermitian=True)
         coefficients = theta[indices]
         statistics[name] = float(coefficients @ inverse @ coefficients)

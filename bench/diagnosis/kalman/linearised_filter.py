@@ -142,8 +142,8 @@ class FollowedRuns:
         )
         best: FollowedRuns | None = None
         unknown = [None] * len(evaluator.prepared_runs)
-        first_states: Sequence[FirstState | None] = unknown
         motions: Sequence[Trajectory | None] = trajectories or unknown
+        first_states: Sequence[FirstState | None] = unknown
         # Near the data, Jacobians change little from one motion to another, so they are reused.
         neighbours: Sequence[MeasuredLinear | None] = unknown
         for iteration in range(max_linearisations if trajectories is None else 1):
@@ -163,10 +163,7 @@ class FollowedRuns:
             # filter replaces the first one in any case, unless motions are simulated.
             is_second_about_possible_motion = iteration == 1 and not robot.is_on_ground
             best = followed if gain > 0.0 or is_second_about_possible_motion else best
-            if robot.is_on_ground:
-                first_states = followed.get_weighted_first_states()
-            else:
-                motions = followed.trajectories
+            motions, first_states = followed._get_smoothed_motions()
             if not gain > LINEARISED_GAIN:
                 break
         assert best is not None
@@ -194,13 +191,7 @@ class FollowedRuns:
         reuses_jacobians = similar is not None or (
             simulator is None and self._has_jacobians_of(theta)
         )
-        neighbours = (similar or self).linear
-        motions: Sequence[Trajectory | None] = [None] * len(neighbours)
-        first_states: Sequence[FirstState | None] = [None] * len(neighbours)
-        if self.is_on_ground:
-            first_states = self.get_weighted_first_states()
-        else:
-            motions = self.trajectories
+        motions, first_states = self._get_smoothed_motions()
         linear = [
             linearise_run(
                 *(self.evaluator, theta, self.noise, run, motion, neighbour, simulator),
@@ -208,12 +199,25 @@ class FollowedRuns:
                 first_state=first_state,
             )
             for run, (motion, neighbour, first_state) in enumerate(
-                zip(motions, neighbours, first_states, strict=True)
+                zip(motions, (similar or self).linear, first_states, strict=True)
             )
         ]
         return self._filter_linear(
             self.evaluator, theta, self.noise, linear, self.force, self.typical
         )
+
+    def _get_smoothed_motions(
+        self,
+    ) -> tuple[Sequence[Trajectory | None], Sequence[FirstState | None]]:
+        """Return the motions about which the runs are linearised next, and their first states.
+
+        For a robot on the ground, only first states are given, from which motions are simulated;
+        they are weighted by inverse covariances. For all others, the smoothed motions are given.
+        """
+        unknown = [None] * len(self.linear)
+        if self.is_on_ground:
+            return unknown, self.first_state_fitter.add_weights(self.get_first_states())
+        return self.trajectories, unknown
 
     @property
     def is_on_ground(self) -> bool:
@@ -233,10 +237,10 @@ class FollowedRuns:
         """
         evaluator = self.evaluator
         changed = set(np.flatnonzero(theta != self.theta).tolist())
-        for name, slot in evaluator.coefficient_slices.items():
+        for name in evaluator.coefficient_slices:
             members = members_of(evaluator.available_effects[name])
             if all(m.hook == "sensor" or m.of in TIME_DEPENDENT_EFFECTS for m in members):
-                changed -= set(range(slot.start, slot.stop))
+                changed -= set(evaluator.get_coefficient_indices(name))
         return not changed
 
     @classmethod
@@ -525,10 +529,6 @@ class FollowedRuns:
                     x[joint], v[joint] = resting, 0.0
             first_states.append(np.concatenate([x, v]))
         return np.array(first_states)
-
-    def get_weighted_first_states(self) -> list[FirstState]:
-        """Return the first states of a robot on the ground, weighted by inverse covariances."""
-        return self.first_state_fitter.add_weights(self.get_first_states())
 
     @cached_property
     def first_state_fitter(self) -> FirstStateFitter:

@@ -12,10 +12,9 @@ from bench.diagnosis.fitting.base_fit import (
     find_start_with_tuner,
     fit_base_model,
     fit_wider,
-    refit_without_step_error,
 )
 from bench.diagnosis.identifiability import freeze_unidentified_parameters
-from bench.diagnosis.pipeline.run_filtering import filter_runs
+from bench.diagnosis.pipeline.run_filtering import filter_simulated_runs
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.validation.held_out_runs import find_first_states
 from sims.core.simulator import Array
@@ -133,18 +132,24 @@ class BaseModel:
     def correct_step_errors(self) -> BaseModel:
         """Return the base model without the discretisation error of the engine's steps.
 
-        The error is corrected if the recording shows it, or if no filter could decide. If a force
-        is missing, such as that of a mass, it may imitate this error, so that the search decides
-        later, with the force in the model.
+        Effects would otherwise explain this error. It is corrected if the recording shows it, or if
+        no filter could decide, unless it is too large. If a force is missing, such as that of a
+        mass, it may imitate this error, so that the search decides later, with the force in the
+        model.
         """
-        # This import is needed for robots only.
+        # These imports are needed for robots only.
+        from bench.diagnosis.evaluation.discretisation_error import correct_discretisation
         from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
 
         evaluator = self.runs.fitting
         followed = evaluator.filtered_runs
         if followed is not None and (followed.has_missing_force or not shows_step_errors(followed)):
             return self
-        return replace(self, fit=refit_without_step_error(evaluator, self.runs.noise, self.fit))
+        fit, noise = self.fit.fit, self.runs.noise
+        correct_discretisation(evaluator, noise, fit.theta, fit.initial_states)
+        if evaluator.discretisation_correction is None:
+            return self
+        return replace(self, fit=self.fit.refit(evaluator, noise))
 
     def finish(self) -> BaseModel:
         """Widen ranges, freeze unidentified numbers and correct the step error of a robot.
@@ -213,7 +218,7 @@ class BaseModel:
 def filter_and_fit(runs: SimulatedRuns) -> BaseModel:
     """Fit the base model; the runs of a robot are filtered before."""
     if runs.kind.has_model:
-        filter_runs(runs)
+        filter_simulated_runs(runs)
     model = BaseModel(runs, fit_base_model(runs.fitting, runs.noise, _get_starts(runs)))
     return model.refit_first_states()
 

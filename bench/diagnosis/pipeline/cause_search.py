@@ -19,7 +19,7 @@ from bench.diagnosis.pipeline.convention_and_unit_checks import RecordingErrorCh
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.pipeline.verdict_builder import restrict_verdict
-from bench.diagnosis.search.diagnose import DiagnosisResult, answer, diagnose
+from bench.diagnosis.search.diagnose import DiagnosisResult, diagnose, run_diagnosis
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
@@ -179,10 +179,10 @@ def _search_and_decide(search: EffectSearch, runs: SimulatedRuns) -> DiagnosisRe
                 propose_contact_effects(search, runs.evaluators)
         return diagnose(search, runs.validation)
     # This import is needed for robots only.
-    from bench.diagnosis.prediction_error.robot_diagnosis import Confirmation
+    from bench.diagnosis.prediction_error.robot_diagnosis import RobotDiagnosis
 
     with runs.record_widened_ranges():
-        return answer(Confirmation(search, runs.validation))
+        return run_diagnosis(RobotDiagnosis(search, runs.validation))
 
 
 def _take_over(

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from bench.diagnosis import residual_analysis
+from bench.diagnosis.fitting.fitted_models import select_likeliest
 from bench.diagnosis.identifiability import ParameterIdentifiability, assess_identifiability
 from bench.diagnosis.pipeline.held_out_gains import HeldOutGains
 from bench.diagnosis.pipeline.search_result import SearchResult
@@ -152,7 +153,7 @@ def _estimate_parameters_by_group(
     ]
     if not other_models:
         return ()
-    best = max(other_models, key=lambda model: model.penalised_log_likelihood)
+    best = select_likeliest(*other_models)
     (name,) = best.effects
     return tuple(
         consistency

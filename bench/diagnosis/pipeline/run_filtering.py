@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
 
-def filter_runs(runs: SimulatedRuns) -> None:
+def filter_simulated_runs(runs: SimulatedRuns) -> None:
     """Filter the runs of a robot with the present model (Kalman filter and smoother).
 
     The filter, stored in the evaluators, provides initial states and starting values of free

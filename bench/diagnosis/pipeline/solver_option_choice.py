@@ -10,9 +10,9 @@ import numpy as np
 from bench.diagnosis.numerics_cause import OptionFinding
 from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.cause_search import CauseSearch
-from bench.diagnosis.pipeline.run_filtering import filter_runs
+from bench.diagnosis.pipeline.run_filtering import filter_simulated_runs
 from bench.diagnosis.pipeline.search_result import SearchResult
-from bench.diagnosis.pipeline.time_step_choice import is_finer_model_better, is_finer_step_better
+from bench.diagnosis.pipeline.time_step_choice import closes_gap_alone, is_clearly_better
 from bench.diagnosis.search.verdict_rules import is_indistinguishable
 
 MAX_LINEAR_RESIDUAL = 3.0
@@ -84,7 +84,7 @@ class RatedOptions(NamedTuple):
         gain = self.log_likelihood - other.log_likelihood
         if options == other_options:
             return not is_indistinguishable(gain)
-        return self.held_out >= other.held_out and is_finer_step_better(
+        return self.held_out >= other.held_out and closes_gap_alone(
             gain, other.residual - 1.0, self.residual - 1.0
         )
 
@@ -145,11 +145,11 @@ class SolverOptionChoice:
         # Ratings are the penalised log-likelihood and the excess residual.
         rating = result.rate()
         option_rating = options.penalised_log_likelihood, options.residual - 1.0
-        if not is_finer_model_better(rating, option_rating) and result.is_explained:
+        if not is_clearly_better(rating, option_rating) and result.is_explained:
             return result
         model = self._use(options, RatedOptions.rate(result.base))
         other = cause_search.search(model.finish())
-        if is_finer_model_better(rating, other.rate()):
+        if is_clearly_better(rating, other.rate()):
             return other
         self.finding = None
         return result
@@ -196,7 +196,7 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
             # The runs take over the filter of the alternative before, if it has one.
             runs = runs.with_kind(robot.with_integrator_settings(alternative.numerics))
             if runs.fitting.filtered_runs is None:
-                filter_runs(runs)
+                filter_simulated_runs(runs)
             tried.append(RatedOptions.rate(rated.model.refit(runs)))
         best = max(tried, key=lambda one: one.log_likelihood, default=rated)
         if best is rated or not best.is_better_than(rated):

@@ -8,13 +8,13 @@ from dataclasses import replace
 from itertools import combinations, tee
 from typing import TYPE_CHECKING, Any
 
-from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS
+from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.numerics_cause import CoarseStepFinding
 from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.cause_search import CauseSearch
-from bench.diagnosis.pipeline.run_filtering import filter_runs
+from bench.diagnosis.pipeline.run_filtering import filter_simulated_runs
 from bench.diagnosis.pipeline.search_result import SearchResult, rate_model
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.search.verdict_rules import improves_held_out, is_indistinguishable
@@ -79,11 +79,11 @@ class TimeStepChoice:
             runs = runs.with_kind(refinement.kind)
             if runs.fitting.filtered_runs is None:
                 # A model that diverges with the file's step may be filtered with a finer one.
-                filter_runs(runs)
+                filter_simulated_runs(runs)
             finer = model.refit(runs)
             log_likelihood, residual_rms = finer.rate()
             gain = log_likelihood - file_log_likelihood
-            if not is_finer_step_better(gain, file_excess, residual_rms - 1.0):
+            if not closes_gap_alone(gain, file_excess, residual_rms - 1.0):
                 # If the step is exact, a missing effect may affect both models: `reconsider`
                 # compares them with it. Otherwise only an exact step is tried next.
                 if refinement.is_accurate_enough(0.0):
@@ -118,7 +118,7 @@ class TimeStepChoice:
         # 1. Step of the file.
         if self._file_runs is not None:
             file_rating = _rate_best_subset(self._file_runs, result)
-            if is_finer_model_better(file_rating, result.rate()):
+            if is_clearly_better(file_rating, result.rate()):
                 return result
             model.runs.context.say(
                 "the time step of the model file explains the data equally well: it is used"
@@ -133,7 +133,7 @@ class TimeStepChoice:
             return result
         runs = model.runs.with_kind(refinement.kind)
         rating, finer_rating = result.rate(), _rate_best_subset(runs, result)
-        if not is_finer_model_better(rating, finer_rating):
+        if not is_clearly_better(rating, finer_rating):
             return result
         (log_likelihood, _), (finer_log_likelihood, _) = rating, finer_rating
         gain = finer_log_likelihood - log_likelihood
@@ -197,36 +197,32 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
         starts, MAX_ITERATIONS if has_few_effects else REFIT_ITERATIONS
     )
     search = runs.create_search(base)
-    best = max(
-        (search.add_fit(subset_fit) for subset_fit in fits),
-        key=lambda model: model.penalised_log_likelihood,
-    )
+    best = select_likeliest(*(search.add_fit(subset_fit) for subset_fit in fits))
     return rate_model(search, best)
 
 
-def is_finer_step_better(gain: float, gap: float, remaining_gap: float) -> bool:
-    """Return whether a finer step is significantly better and alone closes a large part of the gap.
+def closes_gap_alone(gain: float, gap: float, remaining_gap: float) -> bool:
+    """Return whether other settings are significantly better, and close much of the gap alone.
 
     Args:
-        gain: Gain in twice the log-likelihood of the base model.
-        gap: Excess RMS residual of the base model with the file's own step, in units of the noise.
-        remaining_gap: Excess RMS residual of the base model with the finer step, in units of the
-            noise.
+        gain: Gain of the base model in twice the log-likelihood by a finer step or other options.
+        gap: Excess RMS residual of the base model without them, in units of the noise.
+        remaining_gap: Excess RMS residual of the base model with them, in units of the noise.
     """
     return gain >= MIN_FINER_STEP_GAIN and gap - max(remaining_gap, 0.0) >= MIN_CLOSED_SHARE * gap
 
 
-def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float]) -> bool:
-    """Return whether a model with a finer step is significantly better than one with the file's.
+def is_clearly_better(file: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Return whether a model with other settings is significantly better than with the file's.
 
     Args:
         file: Penalised log-likelihood (twice the log-likelihood less log n for each parameter;
-            Schwarz's criterion) and excess RMS residual in units of the noise, with the file's
-            step.
-        finer: The two values with the finer step. Far from the noise floor, autocorrelated
-            residuals bias the likelihood, so the residual must be smaller too.
+            Schwarz's criterion) and excess RMS residual in units of the noise, with the time step
+            and the options of the model file.
+        other: The two values with a finer step or other options. Far from the noise floor,
+            autocorrelated residuals bias the likelihood, so the residual must be smaller too.
     """
-    (file_merit, file_excess), (finer_merit, finer_excess) = file, finer
-    return not is_indistinguishable(finer_merit - file_merit) and improves_held_out(
-        (file_merit, finer_merit), (file_excess, finer_excess)
+    (file_merit, file_excess), (other_merit, other_excess) = file, other
+    return not is_indistinguishable(other_merit - file_merit) and improves_held_out(
+        (file_merit, other_merit), (file_excess, other_excess)
     )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS, FittedModel
+from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS, FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
@@ -37,7 +37,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     make_replacing_start,
     remove_idle_effects,
     select_lowest_of_each,
-    select_more_likely,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
     MAX_IMPROVED_SIZE,
@@ -107,10 +106,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
         return best
     if all(effects in search.models for effects in proposed):
         # Proposed effects that were fitted alone show how good a single effect can be.
-        single = max(
-            (search.models[effects] for effects in proposed),
-            key=lambda model: model.penalised_log_likelihood,
-        )
+        single = select_likeliest(*(search.models[effects] for effects in proposed))
         loss = best.penalised_log_likelihood - single.penalised_log_likelihood
         if 2.0 * loss > COMPETING_MODEL_MARGIN:
             return best
@@ -125,7 +121,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
         if 2.0 * loss > penalty + COMPETING_MODEL_MARGIN:
             return best
         single = fit_filtered(context, single_sets[0])
-    return select_more_likely(fit_competing_models(context, single), best)
+    return select_likeliest(fit_competing_models(context, single), best)
 
 
 def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedModel:
@@ -200,14 +196,12 @@ def _replace_two_effects(context: SearchContext, best: FittedModel) -> FittedMod
     for name, models in replaced.items():
         if len(models) < 2:
             continue
-        likeliest = max(models.values(), key=lambda one: one.penalised_log_likelihood)
+        likeliest = select_likeliest(*models.values())
         coefficients = likeliest.fit.theta[evaluator.coefficient_slices[name]]
         starts.append(make_replacing_start(evaluator, best, list(models)[:2], name, coefficients))
     fits = [context.search.fit_one(start) for start in starts]
-    merged = max(fits, key=lambda one: one.penalised_log_likelihood, default=None)
-    if merged is None or merged.penalised_log_likelihood < best.penalised_log_likelihood:
-        return None
-    return merged
+    merged = select_likeliest(*fits, best)
+    return None if merged is best else merged
 
 
 def _refine_at_force_limits(

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error.dry_friction_fits import (
     check_filter,
@@ -38,7 +38,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     make_filtered_start,
     remove_idle_effects,
     select_lowest_of_each,
-    select_more_likely,
 )
 
 MAX_STEPS = 4
@@ -144,16 +143,16 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     for larger_set in _select_nearly_as_likely(context, larger_sets):
         if not filters.act_where_forces_are_missing(larger_set.names):
             continue
-        best = select_more_likely(best, fit_filtered(context, larger_set))
+        best = select_likeliest(best, fit_filtered(context, larger_set))
         if is_explained(context, best) or search_control.is_over():
             break
     # Step 3. Without dry friction, there is a larger set: otherwise the base model was returned.
     if friction is None and not is_explained(context, best) and not search_control.is_over():
         check_filter(context, larger_sets[0].followed.log_likelihood)
-        best = select_more_likely(best, _fit_all_servos(context, larger_sets[0]))
+        best = select_likeliest(best, _fit_all_servos(context, larger_sets[0]))
     # Step 4.
     if larger_sets and not is_explained(context, best) and not search_control.is_over():
-        best = select_more_likely(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
+        best = select_likeliest(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
     if not np.isfinite(best.fit.cost) or not best.effects:
         return base
     if not is_explained(context, best):

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
-from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
@@ -32,7 +32,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     fit_by_simulation,
     is_explained,
     remove_idle_effects,
-    select_more_likely,
 )
 from sims.core.effect import members_of
 from sims.core.simulator import Array
@@ -70,7 +69,7 @@ def fit_best_scored(scores: OutputErrorScores) -> FittedModel:
     for start in starts[:MAX_FITTED]:
         fitted = fit_by_simulation(context, start)
         if np.isfinite(fitted.fit.cost):
-            best = select_more_likely(best, fitted)
+            best = select_likeliest(best, fitted)
         if is_explained(context, best):
             return remove_idle_effects(context, best)
         if search_control.is_over():
@@ -172,12 +171,12 @@ class OutputErrorScores:
             probe: candidate whose coefficient changes.
         """
         evaluator, theta = self.context.evaluator, self.context.filters.base.theta
-        place = evaluator.get_coefficient_indices(probe.effect)[probe.coefficient_index]
-        step = self.simulations.get_difference(place)
+        index = evaluator.get_coefficient_indices(probe.effect)[probe.coefficient_index]
+        step = self.simulations.get_difference(index)
         simulated = []
         for change in (step, -step):
             changed = theta.copy()
-            changed[place] += change
+            changed[index] += change
             simulated.append(self.simulations.simulate_settled(changed))
         increased, decreased = simulated
         response: Array = np.nan_to_num((increased - decreased) / (2.0 * step))

@@ -37,7 +37,7 @@ from functools import cached_property
 import numpy as np
 
 from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
-from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
@@ -87,7 +87,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_explained,
     is_nearly_explained,
     remove_idle_effects,
-    select_more_likely,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
     fit_likely_effects,
@@ -243,26 +242,26 @@ class PredictionErrorSearch(EffectSearch):
             # Friction of the wrong form leaves a small residual, which many effects would imitate.
             if friction.effects and is_nearly_explained(context, friction):
                 check_fit(context, friction)
-            best = select_more_likely(best, fit_quick_selection(context, selected))
+            best = select_likeliest(best, fit_quick_selection(context, selected))
         if self._should_continue(best) and not has_jumps:
-            best = select_more_likely(best, fit_likely_effects(context, self._likely_starts))
+            best = select_likeliest(best, fit_likely_effects(context, self._likely_starts))
         selected_with_shapes = selected
         if self._should_continue(best):
             selected_with_shapes = context.columns.select_with_shapes(selected)
-            best = select_more_likely(best, fit_quick_selection(context, selected_with_shapes))
+            best = select_likeliest(best, fit_quick_selection(context, selected_with_shapes))
             check_simple_friction(context, best)
         if self._should_continue(best):
             best = self._add_missing_effects(best, selected, friction)
         best = fit_single_in_place(context, best)
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
             # These effects are fitted from other first states, which must not be their only gain.
-            best = select_more_likely(best, self.refit_first_states(self.base_model))
+            best = select_likeliest(best, self.refit_first_states(self.base_model))
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
-            best = select_more_likely(best, fit_series_effects(context, selected_with_shapes))
+            best = select_likeliest(best, fit_series_effects(context, selected_with_shapes))
         # The quick fits may have skipped the selection because it is slow to simulate.
         if not best.effects:
             best = fit_selection(context, selected_with_shapes)
-        return select_more_likely(best, best_single)
+        return select_likeliest(best, best_single)
 
     def _identify_servos(self, selected: Selected) -> IdentifiedSet | None:
         """Identify the servos of a real arm, whose model is incomplete at most joints.
@@ -339,12 +338,12 @@ class PredictionErrorSearch(EffectSearch):
         if is_nearly_explained(context, best):
             check_fit(context, best)
             if len(best.effects) > 1:
-                return select_more_likely(best, add_to_model(context, best))
-        best = select_more_likely(best, fit_single_effects(context))
+                return select_likeliest(best, add_to_model(context, best))
+        best = select_likeliest(best, fit_single_effects(context))
         if self._should_continue(best):
-            best = select_more_likely(best, add_to_dry_friction(context, selected, friction))
+            best = select_likeliest(best, add_to_dry_friction(context, selected, friction))
         if self._should_continue(best):
-            best = select_more_likely(best, select_in_model(context))
+            best = select_likeliest(best, select_in_model(context))
         return best
 
     @property
@@ -396,7 +395,7 @@ class PredictionErrorSearch(EffectSearch):
         if not np.isfinite(model.fit.cost) or is_at_noise(self._search_context, model):
             return model
         start = find_first_states(self.evaluator, self.noise, model.fit)
-        return model if start is None else select_more_likely(model, self.fit_one(start))
+        return model if start is None else select_likeliest(model, self.fit_one(start))
 
     def fit_competing_models(self, best: FittedModel) -> FittedModel:
         """Fit the sets that are nearly as good, and return the best of all."""
@@ -409,7 +408,7 @@ class PredictionErrorSearch(EffectSearch):
         of the gain, corrected for the number of effects in the library, exceeds the threshold.
         """
         base, library_size = self.base_model, len(self.evaluator.library)
-        best = max(self.models.values(), key=lambda model: model.penalised_log_likelihood)
+        best = select_likeliest(*self.models.values())
         indices = [i for name in best.effects for i in self.evaluator.get_coefficient_indices(name)]
         gain = best.likelihood.value - base.likelihood.value
         is_significant = (

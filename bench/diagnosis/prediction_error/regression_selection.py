@@ -50,7 +50,7 @@ from bench.diagnosis.kalman.candidate_responses import (
 )
 from bench.diagnosis.kalman.filter_and_smoother import IndexArray, Mask
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-from bench.diagnosis.prediction_error.response_products import InnerProducts, ResponseProducts
+from bench.diagnosis.prediction_error.response_products import GramMatrices, ResponseProducts
 from bench.diagnosis.search.score_test import (
     NULL_QUANTILE,
     CandidateScores,
@@ -103,7 +103,7 @@ class Regression:
     """
 
     groups: Sequence[DirectionGroup]
-    products: InnerProducts
+    products: GramMatrices | ResponseProducts
     count: int
     contains: Mapping[str, Sequence[str]] = field(default_factory=dict)
     always: tuple[int, ...] = ()

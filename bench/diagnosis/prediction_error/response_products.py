@@ -8,7 +8,6 @@ library are computed when they are needed, in double precision from responses in
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,32 +17,6 @@ from sims.core.simulator import Array
 
 SAMPLES_PER_BLOCK = 128
 """Number of samples that are converted to double precision together; they fit in the CPU cache."""
-
-
-class InnerProducts(Protocol):
-    """Inner products of K columns and the innovations, for R runs.
-
-    Attributes:
-        squares: (R, K) sums of squares of the columns.
-        crosses: Wᵀ e (R, K).
-        totals: eᵀ e (R,).
-    """
-
-    squares: Array
-    crosses: Array
-    totals: Array
-
-    def select_rows(self, columns: IndexArray) -> Array:
-        """Return the products (c, K) of c columns with all columns, summed over all runs."""
-
-    def select(self, columns: IndexArray) -> Array:
-        """Return the products (R, c, c) of c columns with each other."""
-
-    def sum_within(self, groups: IndexArray) -> Array:
-        """Return the products (n, k, k) within n groups of k columns, summed over all runs."""
-
-    def add_to_innovations(self, column: int) -> InnerProducts:
-        """Return the products of the same columns with innovations that contain one of them."""
 
 
 class GramMatrices:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.prediction_error.identification_without_simulation import IdentifiedSet
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
@@ -24,7 +25,7 @@ from bench.diagnosis.search.alternative_causes import (
     differ_in_one_effect,
     select_preferred_model,
 )
-from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_gap_closed
+from bench.diagnosis.search.diagnose import Diagnosis, DiagnosisResult, compute_gap_closed
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit, assess_residual_size
@@ -50,6 +51,12 @@ MAX_REFITTED_COMPETITORS = 4
 """Maximum number of competing models that are fitted to final convergence."""
 
 
+def _compute_p_value(evaluator: RunEvaluator, name: str, gain: float) -> float:
+    """Return the p-value of the gain of an effect in twice the log-likelihood, chi-squared law."""
+    count = len(evaluator.get_coefficient_indices(name))
+    return compute_p_value_of_gain(gain, count, len(evaluator.library))
+
+
 @dataclass(frozen=True)
 class _RobotAlternatives(AlternativeFinder):
     """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
@@ -62,13 +69,10 @@ class _RobotAlternatives(AlternativeFinder):
             effect: name of the effect.
             gain: its gain in twice the log-likelihood.
         """
-        slot = self.search.evaluator.coefficient_slices[effect]
-        return compute_p_value_of_gain(
-            gain, slot.stop - slot.start, len(self.search.evaluator.library)
-        )
+        return _compute_p_value(self.search.evaluator, effect, gain)
 
 
-class Confirmation(Inquiry):
+class RobotDiagnosis(Diagnosis):
     """The steps of the diagnosis of a robot's recording.
 
     Args:
@@ -83,7 +87,7 @@ class Confirmation(Inquiry):
         assert isinstance(search, PredictionErrorSearch)
         self._robot = search
 
-    def answered(self) -> DiagnosisResult:
+    def run(self) -> DiagnosisResult:
         """Return the result of the complete diagnosis.
 
         - If the base model does not fit at all, the search stops at once.
@@ -219,9 +223,7 @@ class Confirmation(Inquiry):
             name: name of the effect.
             gain: its gain in twice the log-likelihood of the innovations.
         """
-        evaluator = self._robot.evaluator
-        count = len(evaluator.get_coefficient_indices(name))
-        p_value = compute_p_value_of_gain(gain, count, len(evaluator.library))
+        p_value = _compute_p_value(self._robot.evaluator, name, gain)
         return CauseEvidence(name, (), p_value, gain, name)
 
     def _evaluate_on_held_out_runs(self) -> None:

@@ -727,13 +727,15 @@ class _ServoFitter:
         evaluator = self._evaluator
         theta, coefficients = model.theta.copy(), dict[int, Array]()
         for joint, name in names.items():
-            slot = evaluator.coefficient_slices[name]
-            low, high = np.array([p.bounds for p in evaluator.parameters[slot]]).T
+            coefficient_slice = evaluator.coefficient_slices[name]
+            low, high = np.array([p.bounds for p in evaluator.parameters[coefficient_slice]]).T
             # A coefficient that is nonnegative has no other sign to try.
             if share < 0.0 and not (low < 0.0).any():
                 continue
-            theta[slot] = np.where((share < 0.0) & (low < 0.0), -share * low, abs(share) * high)
-            coefficients[joint] = theta[slot].copy()
+            theta[coefficient_slice] = np.where(
+                (share < 0.0) & (low < 0.0), -share * low, abs(share) * high
+            )
+            coefficients[joint] = theta[coefficient_slice].copy()
         if not coefficients:
             return
         displaced = self.simulate(theta, model.laws)

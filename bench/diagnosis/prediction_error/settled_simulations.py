@@ -87,19 +87,19 @@ class SettledSimulations:
         for _ in range(MAX_REFINEMENTS):
             # Derivatives of the residual by each coefficient.
             columns = []
-            for place, (_, high) in bounds.items():
-                step = self.get_difference(place)
+            for index, (_, high) in bounds.items():
+                step = self.get_difference(index)
                 changed = theta.copy()
-                changed[place] += step if theta[place] + step <= high else -step
+                changed[index] += step if theta[index] + step <= high else -step
                 difference = self.compute_residual(changed) - residual
-                columns.append(difference / (changed[place] - theta[place]))
+                columns.append(difference / (changed[index] - theta[index]))
             # A simulation may diverge.
             if not np.isfinite(columns).all():
                 break
             change = np.linalg.lstsq(np.stack(columns, axis=1), -residual, rcond=None)[0]
             changed = theta.copy()
-            for (place, (low, high)), value in zip(bounds.items(), change.tolist(), strict=True):
-                changed[place] = np.clip(theta[place] + value, low, high)
+            for (index, (low, high)), value in zip(bounds.items(), change.tolist(), strict=True):
+                changed[index] = np.clip(theta[index] + value, low, high)
             new_residual = self.compute_residual(changed)
             before, after = residual @ residual, new_residual @ new_residual
             if not after < before:
@@ -128,9 +128,9 @@ class SettledSimulations:
         residual = self.fitter.simulate_residuals(theta, self._settle(theta))
         return self.project(residual[..., None]).reshape(-1)
 
-    def get_difference(self, place: int) -> float:
+    def get_difference(self, index: int) -> float:
         """Return the finite change of a coefficient, by its index in theta."""
-        low, high = self.fitter.evaluator.parameters[place].bounds
+        low, high = self.fitter.evaluator.parameters[index].bounds
         return DIFFERENCE_SHARE * (float(high) - float(low))
 
     def simulate_settled(self, theta: Array) -> Array:
@@ -185,14 +185,14 @@ def refine_with_wide_differences(
     residual = fitter.simulate_residuals(theta, states)
     squares = _sum_squares(residual)
     jacobian = fit.jacobian.copy()
-    columns, places = list[Array](), list[int]()
-    for column, place in enumerate(fit.free_indices.tolist()):
-        if place not in bounds:
+    columns, indices = list[Array](), list[int]()
+    for column, index in enumerate(fit.free_indices.tolist()):
+        if index not in bounds:
             continue
-        places.append(place)
+        indices.append(index)
         # The derivative by small differences tells about how wide the change must be.
         norm = np.sqrt(_sum_squares(fitter.scale_by_noise(fit.parameter_jacobian[..., column])))
-        quotient = _compute_wide_quotient(fitter, theta, states, place, bounds[place], norm)
+        quotient = _compute_wide_quotient(fitter, theta, states, index, bounds[index], norm)
         if not np.isfinite(quotient[np.isfinite(fitter.evaluator.observed)]).all():
             return fit
         jacobian[..., column] = quotient
@@ -203,8 +203,8 @@ def refine_with_wide_differences(
     for _ in range(MAX_WIDE_STEPS):
         step = np.linalg.lstsq(derivatives, np.nan_to_num(residual).reshape(-1), rcond=None)[0]
         tried = theta.copy()
-        for place, change in zip(places, step.tolist(), strict=True):
-            tried[place] = np.clip(theta[place] + change, *bounds[place])
+        for index, change in zip(indices, step.tolist(), strict=True):
+            tried[index] = np.clip(theta[index] + change, *bounds[index])
         tried_states = fitter.fit_settled_states(tried, states)
         tried_residual = fitter.simulate_residuals(tried, tried_states)
         if not _sum_squares(tried_residual) < squares:
@@ -225,7 +225,7 @@ def refine_with_wide_differences(
 
 
 def _compute_wide_quotient(
-    fitter: FirstStateFitter, theta: Array, states: Array, place: int, bounds: Bounds, norm: float
+    fitter: FirstStateFitter, theta: Array, states: Array, index: int, bounds: Bounds, norm: float
 ) -> Array:
     """Compute the difference quotient (2) by one coefficient, (R, T, C).
 
@@ -237,7 +237,7 @@ def _compute_wide_quotient(
         fitter: simulates the pieces, and fits their first states.
         theta: (P,) parameters.
         states: (R, 2 D) first states.
-        place: index of the coefficient in theta.
+        index: index of the coefficient in theta.
         bounds: bounds of the coefficient; the difference ends at them.
         norm: norm of the derivative by small differences, in units of the noise, as a first guess.
     """
@@ -248,8 +248,8 @@ def _compute_wide_quotient(
         ends, simulated = [], []
         for sign in (1.0, -1.0):
             changed = theta.copy()
-            changed[place] = np.clip(theta[place] + sign * half, low, high)
-            ends.append(changed[place])
+            changed[index] = np.clip(theta[index] + sign * half, low, high)
+            ends.append(changed[index])
             simulated.append(fitter.simulate(changed, fitter.fit_settled_states(changed, states)))
         difference = simulated[0] - simulated[1]
         quotient: Array = difference / max(ends[0] - ends[1], np.finfo(float).tiny)

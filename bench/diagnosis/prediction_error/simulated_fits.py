@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import compute_start_costs
-from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 from bench.diagnosis.friction_form_verdict import has_dry_friction
@@ -270,16 +270,6 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
     )
 
 
-def select_more_likely(one: FittedModel, other: FittedModel) -> FittedModel:
-    """Return the model with the higher penalised log-likelihood; the first one if they are equal.
-
-    Args:
-        one: a fitted model.
-        other: another one.
-    """
-    return max(one, other, key=lambda model: model.penalised_log_likelihood)
-
-
 def remove_idle_effects(context: SearchContext, model: FittedModel) -> FittedModel:
     """Remove effects that gain less than their penalty, and simplify families.
 
@@ -414,7 +404,7 @@ def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
     fitted = remove_idle_effects(context, fitted)
     if selected.shows_steps:
         fitted = context.search.correct_step_errors(fitted)
-    return select_more_likely(fitted, base)
+    return select_likeliest(fitted, base)
 
 
 def drop_surplus_effects(

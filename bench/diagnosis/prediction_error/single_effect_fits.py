@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
-from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error.dry_friction_fits import check_filter, check_fit
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
@@ -36,7 +36,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     list_nearby_starts,
     remove_idle_effects,
     select_lowest_of_each,
-    select_more_likely,
 )
 from sims.core.effect import members_of
 from sims.robot.dynamics.series_joints import is_series_effect
@@ -174,7 +173,7 @@ def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStar
         if not is_explained(context, fitted) and is_nearly_explained(context, fitted):
             fitted = fit_nearby(context, fitted, fitted.effects[0])
         if np.isfinite(fitted.fit.cost):
-            best = select_more_likely(best, fitted)
+            best = select_likeliest(best, fitted)
         if is_explained(context, best):
             return remove_idle_effects(context, best)
     return best
@@ -210,9 +209,9 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
         ]
         if batch and not is_explained(context, best):
             fitted += search.fit_all(batch)
-            best = max(fitted, key=lambda model: model.penalised_log_likelihood)
+            best = select_likeliest(*fitted)
     if not is_explained(context, best):
-        best = select_more_likely(best, refine_single_effects(context, fitted))
+        best = select_likeliest(best, refine_single_effects(context, fitted))
     if is_explained(context, best):
         return remove_idle_effects(context, best)
     check_filter(context, filters.get_filter(best).log_likelihood)
@@ -250,7 +249,7 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
         refined = fit_by_simulation(context, start)
         if not is_at_noise(context, refined) and is_nearly_explained(context, refined):
             refined = fit_nearby(context, refined, refined.effects[0])
-        best = select_more_likely(best, refined)
+        best = select_likeliest(best, refined)
         if is_explained(context, best) or context.evaluator.search_control.is_over():
             break
     return best
@@ -288,6 +287,4 @@ def fit_series_effects(context: SearchContext, selected: Selected) -> FittedMode
         theta = context.filters.make_theta_with(probe.effect, probe.coefficients)
         starts.append(FitStart((probe.effect,), theta, evaluator.initial_state_guesses))
     fitted = search.fit_all([start for _, start in select_lowest_of_each(context, starts)])
-    return fit_by_simulation(
-        context, max(fitted, key=lambda model: model.penalised_log_likelihood).fit.make_start()
-    )
+    return fit_by_simulation(context, select_likeliest(*fitted).fit.make_start())

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.search.effect_search import (
     FAR_EXCESS,
@@ -98,7 +98,7 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     search.refit_models([*starts, *neighbour_starts], noise)
     # A refit that ends worse is not stored, so the table contains the best fit of each model.
     refitted = [search.models[frozenset(candidate.effects)] for candidate in compared_models]
-    return max(refitted, key=lambda candidate: candidate.penalised_log_likelihood)
+    return select_likeliest(*refitted)
 
 
 def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
@@ -262,7 +262,7 @@ class CauseEvidence:
     preferred: str = ""
 
 
-class _CompetingEffect(NamedTuple):
+class _Competitor(NamedTuple):
     """Effect that explains the data about as well as an effect of the model, in its place.
 
     Attributes:
@@ -368,7 +368,7 @@ class AlternativeFinder:
         by_score = search.best_p_values.get(key, 1.0)
         return min(by_score, by_refit)
 
-    def _list_competing_effects(self, model: FittedModel, effect: str) -> list[_CompetingEffect]:
+    def _list_competing_effects(self, model: FittedModel, effect: str) -> list[_Competitor]:
         """List the effects that explain the data as well as the given one, with their distance.
 
         The report names them, because the data do not tell which of them acts. A competing effect
@@ -377,7 +377,7 @@ class AlternativeFinder:
         itself has the distance 0.
         """
         shared = set(model.effects) - {effect}
-        competing_effects = [_CompetingEffect(0.0, effect)]
+        competing_effects = [_Competitor(0.0, effect)]
         for other_model in list(self.search.models.values()):
             names = set(other_model.effects)
             has_same_size = len(names) == len(model.effects)
@@ -394,7 +394,7 @@ class AlternativeFinder:
             if is_indistinguishable(distance) and not self._wastes_coefficients(
                 effect, added, distance
             ):
-                competing_effects.append(_CompetingEffect(distance, added))
+                competing_effects.append(_Competitor(distance, added))
         return self._remove_richer(competing_effects)
 
     def _wastes_coefficients(self, effect: str, other_effect: str, distance: float) -> bool:
@@ -423,7 +423,7 @@ class AlternativeFinder:
             [MAX_RICHER_LAW_EXCESS_RATIO]
         )
 
-    def _remove_richer(self, competing_effects: list[_CompetingEffect]) -> list[_CompetingEffect]:
+    def _remove_richer(self, competing_effects: list[_Competitor]) -> list[_Competitor]:
         """Return the competing effects without those that contain another of them.
 
         These are families (one effect at several places) of which one member explains as much, and
@@ -537,7 +537,7 @@ class AlternativeFinder:
         models_with_effect = [m for m in self.search.models.values() if effect in m.effects]
         if not models_with_effect:
             return float("inf")
-        best = max(models_with_effect, key=lambda m: m.penalised_log_likelihood)
+        best = select_likeliest(*models_with_effect)
         parameters = evaluator.parameters[evaluator.coefficient_slices[effect]]
         values = best.fit.theta[evaluator.coefficient_slices[effect]].tolist()
         distances = [1.0]

@@ -25,11 +25,11 @@ import numpy as np
 from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.kalman.cubature_filter import (
     FIRST_STATE_MARGIN,
-    Hypothesis,
+    FilterHypothesis,
     compute_first_deviations,
     filter_hypotheses,
     set_first_states_in_contact,
@@ -42,7 +42,7 @@ from bench.diagnosis.search.effect_search import (
     EffectSearch,
 )
 from bench.diagnosis.search.fit_starts import select_refit_starts
-from bench.diagnosis.search.random_search import EXPLAINED_SQUARES, RandomSearch
+from bench.diagnosis.search.random_search import EXPLAINED_SQUARES, RandomStartSearch
 from bench.diagnosis.search.score_test import SHAPE_COUNT_FOR_MULTISTART, ScoreTest
 from sims.core.effect import members_of
 from sims.core.simulator import Array
@@ -308,7 +308,7 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
             theta = _add_effect(search, _scan_in_turn(search, value, NEAR_SCAN_WIDTHS, states))
         # 3. Random search.
         widths = _compute_widths(search, name, theta[indices])
-        best_sample = RandomSearch(evaluator, sigma, smoothed, rng).run(
+        best_sample = RandomStartSearch(evaluator, sigma, smoothed, rng).run(
             theta, indices, widths, bounds
         )
         evaluator.begin_at(
@@ -387,7 +387,7 @@ def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array)
         return
     rng = search.make_rng("initial states")
     # No coefficients are varied.
-    best_sample = RandomSearch(runs, sigma, smoothed, rng).run(
+    best_sample = RandomStartSearch(runs, sigma, smoothed, rng).run(
         theta, indices=[], widths=np.zeros(0), bounds=np.zeros((0, 2))
     )
     if best_sample.mean_square * sample_count < before:
@@ -580,7 +580,7 @@ def _compute_log_likelihoods(search: EffectSearch, values: Sequence[_ScannedValu
     evaluator.search_control.check_not_stopped()
     runs = range(len(evaluator.prepared_runs))
     hypotheses = [
-        Hypothesis(run, theta, COMPARED_FORCE_SHARE)
+        FilterHypothesis(run, theta, COMPARED_FORCE_SHARE)
         for theta in (_add_effect(search, value) for value in values)
         for run in runs
     ]
@@ -657,7 +657,7 @@ def _search_simple_laws(search: EffectSearch) -> FittedModel:
     Args:
         search: search with its models.
     """
-    best = max(search.models.values(), key=lambda model: model.penalised_log_likelihood)
+    best = select_likeliest(*search.models.values())
     if not search.is_noise_like(best) or not search.is_complete(best, MAX_P_VALUE_FURTHER_EFFECT):
         return search.run()
     if not best.effects:
@@ -667,7 +667,7 @@ def _search_simple_laws(search: EffectSearch) -> FittedModel:
     search.reference_scores = search.score_missing_effects(best)
     _fit_competing_effects(search, best)
     models = [model for model in search.models.values() if len(model.effects) == 1]
-    return max(models, key=lambda model: model.penalised_log_likelihood)
+    return select_likeliest(*models)
 
 
 def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:

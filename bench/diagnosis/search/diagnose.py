@@ -82,18 +82,18 @@ def diagnose(search: EffectSearch, held_out: Validation | None) -> DiagnosisResu
         search: the search, which contains the fitted base model.
         held_out: held-out runs for validation; None if there are none.
     """
-    return answer(Inquiry(search, held_out))
+    return run_diagnosis(Diagnosis(search, held_out))
 
 
-def answer(inquiry: Inquiry) -> DiagnosisResult:
+def run_diagnosis(diagnosis: Diagnosis) -> DiagnosisResult:
     """Run the complete diagnosis, or as many of its steps as the time limit allows."""
     try:
-        return inquiry.answered()
+        return diagnosis.run()
     except SearchStoppedError:
-        return inquiry.build_early_result()
+        return diagnosis.build_early_result()
 
 
-class Inquiry:
+class Diagnosis:
     """The steps of a diagnosis, and their results so far.
 
     Attributes:
@@ -120,7 +120,7 @@ class Inquiry:
         self._held_out_validation: HeldOutValidation | None = None
         self._model: FittedModel | None = None
 
-    def answered(self) -> DiagnosisResult:
+    def run(self) -> DiagnosisResult:
         """Return the result of the complete diagnosis.
 
         1. Stop if nothing moves, or the data do not determine the base model.

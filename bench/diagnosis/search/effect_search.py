@@ -16,7 +16,7 @@ from itertools import chain
 
 import numpy as np
 
-from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.fitting.multiple_shooting import (
     forgets_initial_state,
@@ -195,7 +195,7 @@ class EffectSearch(ScoredModelSet):
         scores = self.scores_by_effects.get(frozenset(best.effects))
         if scores is None or not larger:
             return best
-        best_extension = max(larger, key=lambda model: model.penalised_log_likelihood)
+        best_extension = select_likeliest(*larger)
         gain = best_extension.likelihood.value - best.likelihood.value
         if (
             self.compute_gain_p_value(scores, best_extension, gain) <= EFFECT_P_VALUE_THRESHOLD

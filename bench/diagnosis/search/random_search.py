@@ -59,7 +59,7 @@ class BestSample(NamedTuple):
     mean_square: float
 
 
-class RandomSearch:
+class RandomStartSearch:
     """Random search of coefficients, and of the initial states of all runs.
 
     The initial state of a run is its smoothed mean plus a root of its covariance times a deviate,

@@ -17,8 +17,8 @@ from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext
 from bench.diagnosis.pipeline.time_step_choice import (
     MIN_FINER_STEP_GAIN,
     TimeStepChoice,
-    is_finer_model_better,
-    is_finer_step_better,
+    closes_gap_alone,
+    is_clearly_better,
 )
 from tests.bench.diagnosis.arm_model import ARM
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
@@ -121,7 +121,7 @@ def test_a_urdf_has_no_step_that_could_be_wrong(tmp_path):
     ],
 )
 def test_when_a_finer_step_is_used_in_the_search(gain, gap, left, better):
-    assert is_finer_step_better(gain, gap, left) is better
+    assert closes_gap_alone(gain, gap, left) is better
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_when_a_finer_step_is_used_in_the_search(gain, gap, left, better):
     ],
 )
 def test_when_a_finer_step_is_better_once_causes_are_known(file, finer, better):
-    assert is_finer_model_better(file, finer) is better
+    assert is_clearly_better(file, finer) is better
 
 
 @pytest.mark.slow

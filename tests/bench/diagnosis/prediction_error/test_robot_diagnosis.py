@@ -6,7 +6,7 @@ import pytest
 
 from bench.diagnosis.prediction_error.robot_diagnosis import (
     MAX_REFITTED_COMPETITORS,
-    Confirmation,
+    RobotDiagnosis,
 )
 from tests.bench.diagnosis.search.search_models import model
 
@@ -15,13 +15,13 @@ def refit(gain, *others, effects=("a",)):
     """Return the effects of the competitors that are refitted after a final fit with this gain."""
     best = model(*effects, likelihood=1000.0)
     refitted = []
-    inquiry = Confirmation.__new__(Confirmation)
-    inquiry._model = best
-    inquiry._robot = SimpleNamespace(
+    diagnosis = RobotDiagnosis.__new__(RobotDiagnosis)
+    diagnosis._model = best
+    diagnosis._robot = SimpleNamespace(
         models={frozenset(m.effects): m for m in (best, *others)},
         fit_to_convergence=lambda m: refitted.append(m.effects),
     )
-    inquiry._refit_near_competitors(gain)
+    diagnosis._refit_near_competitors(gain)
     return refitted
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.diagnosis.search.diagnose import Inquiry, compute_gap_closed
+from bench.diagnosis.search.diagnose import Diagnosis, compute_gap_closed
 from tests.bench.diagnosis.search.search_models import model
 
 SIGMA = 0.1
@@ -73,13 +73,13 @@ def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
         fit_to_convergence=lambda m: m,
         simplify_laws=lambda m: PLAINER if m is FULLER else m,
     )
-    inquiry = Inquiry(search, None)
-    inquiry._model = found
+    diagnosis = Diagnosis(search, None)
+    diagnosis._model = found
     if held_out:
-        inquiry._held_out_validation = SimpleNamespace(
+        diagnosis._held_out_validation = SimpleNamespace(
             find_better_extension=lambda search, model: fuller, evaluate_models=measured.extend
         )
-    taken = inquiry._accept_larger_model(SimpleNamespace(has_structure=structure))
-    assert inquiry._model is stands
+    taken = diagnosis._accept_larger_model(SimpleNamespace(has_structure=structure))
+    assert diagnosis._model is stands
     assert taken is (stands is PLAINER)
     assert measured == ([PLAINER] if taken else [])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.kalman.cubature_filter import SmoothedStart
-from bench.diagnosis.search.random_search import RandomSearch
+from bench.diagnosis.search.random_search import RandomStartSearch
 
 NOISE = 1e-4
 TIMES = np.linspace(0.0, 1.0, 101)
@@ -45,7 +45,7 @@ def make_search(known=False, seed=0):
     deviations = np.array([NOISE, 1e-3])
     covariance = np.diag(deviations**2)
     smoothed = [SmoothedStart(0.0, start + 2.0 * deviations, covariance) for start in STARTS]
-    return RandomSearch(evaluator, np.array([NOISE]), smoothed, np.random.default_rng(seed))
+    return RandomStartSearch(evaluator, np.array([NOISE]), smoothed, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("seed", range(3))
