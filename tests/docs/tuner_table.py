@@ -25,8 +25,9 @@ SET = {
         r"w(s) = (1 - s^2)^4, \quad s \text{ from } -1 \text{ to } 1 \text{ over the bump}"
     ),
     "zeta_k = zeta_{k-1} + h(o_P, o_T)": r"\zeta_k = \zeta_{k-1} + h(o_P, o_T)",
-    "s = -B^-1 h, at first B = -1, which is (1)": (
-        r"s = -B^{-1} h, \quad \text{at first } B = -1, \text{ which is (1)}"
+    "s = -B^-1 h, at first B = -1, which is a step of TuneNet's Algorithm 1": (
+        r"s = -B^{-1} h, \quad \text{at first } B = -1,"
+        r" \text{ which is a step of TuneNet's Algorithm 1}"
     ),
     "B <- B + (y - B s) s^T / (s^T s)": r"B \leftarrow B + \frac{(y - B s)\, s^T}{s^T s}",
     "EI = (f - m) Phi((f - m) / s) + s phi((f - m) / s)": (
@@ -100,6 +101,7 @@ SET = {
 EQUATION = re.compile(r"\(([\d.]+)\)  (.*)", re.S)
 SHARED = (
     "pair_network",
+    "broyden_search",
     "observation_features",
     "scenario_features",
     "gap_filling",
