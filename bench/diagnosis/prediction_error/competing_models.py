@@ -151,7 +151,7 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
             start = make_replacing_start(
                 evaluator, best, [name], competing_effect.effect, competing_effect.coefficients
             )
-            if frozenset(start.effects) in search.models:
+            if not _should_fit(context, best, competing_effect, start):
                 continue
             confirmed = _confirm(context, best, competing_effect, start)
             starts += [confirmed] if confirmed is not None else []
@@ -167,12 +167,33 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
     merged = _replace_two_effects(context, preferred)
     if merged is not None:
         return fit_competing_models(context, merged)
-    if preferred is best:
-        return best
-    # A family may replace another one, and a single member of it may be enough.
-    simpler = remove_idle_effects(context, preferred)
-    is_same = simpler.effects == preferred.effects
-    return preferred if is_same else fit_competing_models(context, simpler)
+    if set(preferred.effects) == set(best.effects):
+        return preferred
+    # A family may replace another one, and a single member of it may be enough. About a better
+    # model, effects that act alike have better starts.
+    return fit_competing_models(context, remove_idle_effects(context, preferred))
+
+
+def _should_fit(
+    context: SearchContext, best: FittedModel, competing_effect: _CompetingEffect, start: FitStart
+) -> bool:
+    """Return whether to fit a competing model: it is not fitted yet, or worse than predicted.
+
+    Fits with dry friction may stop in local minima. An effect that acts like that of the best model
+    is then as good if it starts from there.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model.
+        competing_effect: the effect that replaces one of its effects.
+        start: start of a fit of the competing model.
+    """
+    fitted = context.search.models.get(frozenset(start.effects))
+    if fitted is None:
+        return True
+    loss = 2.0 * (best.penalised_log_likelihood - fitted.penalised_log_likelihood)
+    is_near = competing_effect.loss <= COMPETING_MODEL_MARGIN
+    return is_near and loss > COMPETING_MODEL_MARGIN + competing_effect.loss
 
 
 def _replace_two_effects(context: SearchContext, best: FittedModel) -> FittedModel | None:

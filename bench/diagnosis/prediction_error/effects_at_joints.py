@@ -118,7 +118,7 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
 
     These simple effects (Coulomb friction, drag, armature, stiffness and damping of the servo)
     often imitate another effect at the same joint. Families (effects at every place, ``@*``) are
-    left out.
+    left out, unless the effect is one.
 
     Args:
         evaluator: the runs.
@@ -131,7 +131,7 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
         other
         for other in evaluator.library
         if other.partition("@")[0] in JOINT_MODEL + SERVO_MODEL
-        and not other.endswith("@*")
+        and (name.endswith("@*") or not other.endswith("@*"))
         and acts_at_joint(evaluator, other, joints)
     }
 
