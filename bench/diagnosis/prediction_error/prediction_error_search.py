@@ -9,9 +9,11 @@ residual of a set is only noise. The order is:
     1. Select effects with few shapes by regression. If the selection leaves a large residual of a
        robot with servos, identify the servos (`servo_identification`), and do nothing of the
        following. Otherwise fit the dry friction among them first, because it is not linear where a
-       joint sticks (`dry_friction_fits`), and then the set (`simulated_fits`). If this fails, or
-       before it if servos reach their limits, simulate single effects at several coefficients, and
-       fit the best of them (`single_effect_fits`).
+       joint sticks (`dry_friction_fits`), and then the set (`simulated_fits`). If this fails, and
+       friction acts at all joints, select the other effects with it in the filter's model
+       (`selection_with_friction`).
+       If this fails too, or before it if servos reach their limits, simulate single effects at
+       several coefficients, and fit the best of them (`single_effect_fits`).
     2. If a force is still missing, select again, with effects of many shapes at the joints where it
        is missing (`regression_columns`).
     3. Fit each of the effects with the largest gains alone, and those of the standard joint model
@@ -72,6 +74,7 @@ from bench.diagnosis.prediction_error.regression_selection import (
     score_by_regression,
     shows_step_errors,
 )
+from bench.diagnosis.prediction_error.selection_with_friction import select_with_friction
 from bench.diagnosis.prediction_error.servo_identification import (
     MIN_EXCESS,
     has_unknown_servos,
@@ -205,7 +208,8 @@ class PredictionErrorSearch(EffectSearch):
         1. single effects of a robot on the ground, by the residual of simulations;
         2. likely effects alone, if servos reach their limits (otherwise after 4);
         3. identification servo by servo, after which nothing else is done if it succeeds;
-        4. dry friction alone, then the set that regression selects;
+        4. dry friction alone, then the set that regression selects, then the set that regressions
+           with dry friction of all joints in the model select;
         5. effects with many shapes, such as forces of any period;
         6. effects that regression missed: singly, then one by one in addition to others;
         7. one effect in place of several;
@@ -243,6 +247,8 @@ class PredictionErrorSearch(EffectSearch):
             if friction.effects and is_nearly_explained(context, friction):
                 check_fit(context, friction)
             best = select_likeliest(best, fit_quick_selection(context, selected))
+        if self._should_continue(best):
+            best = select_likeliest(best, select_with_friction(context, selected))
         if self._should_continue(best) and not has_jumps:
             best = select_likeliest(best, fit_likely_effects(context, self._likely_starts))
         selected_with_shapes = selected

@@ -1,0 +1,161 @@
+"""Selection of effects by filters that have dry friction in their model.
+
+A joint that sticks makes a regression about the base model, which is linear, unreliable for all
+other effects. A filter with the friction in its model follows the joint, so that its innovations
+are nearly linear in the effects that are left: several are selected by one regression, and the next
+regression is made about a filter with these (iterated linearisation, as in the Gauss-Newton method;
+J. Nocedal, S. Wright, Numerical Optimization, 2nd ed., 2006, section 10.3). Only the last set is
+fitted by simulation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
+from bench.diagnosis.fitting.fitted_models import FittedModel
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.kalman.likelihood_fit import compute_information, compute_wald_statistics
+from bench.diagnosis.prediction_error.dry_friction_fits import make_dry_friction_start
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
+from bench.diagnosis.prediction_error.effects_at_joints import JOINT_MODEL
+from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
+from bench.diagnosis.prediction_error.regression_columns import build_regression_about
+from bench.diagnosis.prediction_error.regression_selection import (
+    MAX_SET_SIZE,
+    Regression,
+    Selected,
+)
+from bench.diagnosis.prediction_error.simulated_fits import (
+    fit_filtered,
+    is_explained,
+    remove_idle_effects,
+)
+from bench.diagnosis.search.fit_starts import add_effect_to_start
+from bench.diagnosis.search.score_test import DirectionGroup
+from sims.core.simulator import Array
+
+FRICTION_FAMILY = "friction.coulomb@*"
+"""Dry friction of all joints."""
+JOINT_MODEL_STEPS = 4
+"""Maximum number of Gauss-Newton steps for the coefficients of the standard joint model."""
+MAX_REGRESSIONS = 3
+"""Maximum number of regressions, each about a filter with the effects of the previous ones."""
+
+
+def select_with_friction(context: SearchContext, selected: Selected) -> FittedModel:
+    """Select the other effects with dry friction of all joints in the filter's model.
+
+    Nothing is done if the selection has no friction of all joints: effects in addition to friction
+    at one joint are found faster one by one.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        selected: the selection about the base model, whose dry friction is used.
+
+    Returns:
+        The set, fitted by simulation; the base model if nothing is done, or nothing is selected in
+        addition to the friction.
+    """
+    friction = make_dry_friction_start(context, selected)
+    if FRICTION_FAMILY not in friction.effects:
+        return context.search.base_model
+    current = _follow_joint_model(context, friction)
+    for _ in range(MAX_REGRESSIONS):
+        larger = _add_selected(context, current)
+        if larger is None:
+            break
+        current = larger
+    if len(current.names) == len(friction.effects):
+        return context.search.base_model
+    fitted = fit_filtered(context, current)
+    return remove_idle_effects(context, fitted) if is_explained(context, fitted) else fitted
+
+
+def _follow_joint_model(context: SearchContext, friction: FitStart) -> FilteredSet:
+    """Follow the runs with the standard joint model at all joints, as far as it is needed.
+
+    A robot whose file has no friction mostly lacks viscous friction and the inertia of its motors,
+    too. These effects are added together, and those that gain less than their penalty are removed.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        friction: dry friction of all joints.
+    """
+    filters, evaluator = context.filters, context.evaluator
+    others = [
+        name
+        for name in (f"{effect}@*" for effect in JOINT_MODEL)
+        if name in evaluator.library and name not in friction.effects
+    ]
+    current = filters.follow_with_effects(
+        friction.theta, (*friction.effects, *others), JOINT_MODEL_STEPS
+    )
+    theta = current.followed.theta.copy()
+    information = compute_information(
+        current.followed, get_bounds_by_index(evaluator, current.names)
+    )
+    gains = compute_wald_statistics(evaluator, theta, current.names, information)
+    idle = [name for name in others if gains[name] < filters.penalty(name)]
+    if not idle:
+        return current
+    for name in idle:
+        theta[evaluator.coefficient_slices[name]] = 0.0
+    return filters.follow_with_effects(theta, [n for n in current.names if n not in idle])
+
+
+def _add_selected(context: SearchContext, current: FilteredSet) -> FilteredSet | None:
+    """Add the effects that a regression about a set selects, and improve the coefficients.
+
+    The first effects of the selection are added, as many as make the filter likelier: the
+    regression is linear, so that it may select effects that imitate the nonlinear part of others.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set.
+
+    Returns:
+        The larger set; None if nothing is selected or the larger set is hardly likelier.
+    """
+    filters = context.filters
+    regression, _ = build_regression_about(current, [context.columns.library], current.followed)
+    best, first_log_likelihood = current, -np.inf
+    for count in range(1, MAX_SET_SIZE + 1):
+        chosen = [group for group in regression.select(count) if group.effect not in current.names]
+        if len(chosen) < count:
+            break
+        larger = filters.follow_with_effects(
+            *_make_larger(context, current, chosen, regression), steps=0
+        )
+        if larger.followed.log_likelihood <= first_log_likelihood:
+            break
+        first_log_likelihood = larger.followed.log_likelihood
+        larger = filters.improve(larger)
+        price = sum(filters.penalty(name) for name in larger.names[len(best.names) :])
+        if 2.0 * (larger.followed.log_likelihood - best.followed.log_likelihood) < price:
+            break
+        best = larger
+    return None if best is current else best
+
+
+def _make_larger(
+    context: SearchContext,
+    current: FilteredSet,
+    chosen: Sequence[DirectionGroup],
+    regression: Regression,
+) -> tuple[Array, tuple[str, ...]]:
+    """Return the parameters (P,) and effects of a set with further effects from a regression.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        current: the set.
+        chosen: groups of columns of the further effects.
+        regression: regression about the set, which gives their coefficients.
+    """
+    start = FitStart(current.names, current.followed.theta, context.evaluator.initial_state_guesses)
+    for group, solution in zip(chosen, regression.solve(chosen).coefficients, strict=True):
+        coefficients = context.columns.coefficients(group, solution)
+        start = add_effect_to_start(context.evaluator, start, group.effect, coefficients)
+    return start.theta, start.effects
