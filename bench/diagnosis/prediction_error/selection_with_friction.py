@@ -62,7 +62,7 @@ def select_with_friction(context: SearchContext, selected: Selected) -> FittedMo
     friction = make_dry_friction_start(context, selected)
     if FRICTION_FAMILY not in friction.effects:
         return context.search.base_model
-    current = _follow_joint_model(context, friction)
+    current = _choose_start(context, friction)
     for _ in range(MAX_REGRESSIONS):
         larger = _add_selected(context, current)
         if larger is None:
@@ -72,6 +72,27 @@ def select_with_friction(context: SearchContext, selected: Selected) -> FittedMo
         return context.search.base_model
     fitted = fit_filtered(context, current)
     return remove_idle_effects(context, fitted) if is_explained(context, fitted) else fitted
+
+
+def _choose_start(context: SearchContext, friction: FitStart) -> FilteredSet:
+    """Return dry friction with the first selected effects, or the standard joint model.
+
+    Motor inertia at all joints imitates a payload, so the joint model is not always better. The
+    set with the larger likelihood is returned, each minus the penalties of its effects.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        friction: dry friction of all joints.
+    """
+    filters = context.filters
+
+    def compute_criterion(current: FilteredSet) -> float:
+        penalty = sum(filters.penalty(name) for name in current.names)
+        return 2.0 * current.followed.log_likelihood - penalty
+
+    alone = filters.follow_with_effects(friction.theta, friction.effects)
+    selected = _add_selected(context, alone) or alone
+    return max(selected, _follow_joint_model(context, friction), key=compute_criterion)
 
 
 def _follow_joint_model(context: SearchContext, friction: FitStart) -> FilteredSet:
