@@ -58,8 +58,6 @@ MAX_REPLACED_FORCE_SHARE = 0.3
 
 With right effects 0.005 to 0.21 remained, since the filter is linear about the base model's motion.
 """
-MAX_STORED_EXTENSIONS = 3
-"""Maximum number of extended sets whose results are stored; each takes hundreds of megabytes."""
 MAX_IMITATIONS = 2
 """Number of effects in a row that replace no missing force after which no other is added."""
 ALL_SERVOS_STEPS = 6
@@ -221,8 +219,7 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
     The effects with the largest gains by regression are tried first. If one of them replaces a
     missing force, the others, which a regression may have missed, are not tried. The result is
     cached, because sets that grow from different effects may become equal. It is reused unless
-    effects were added to the library, or the set now follows the runs much better. Only the newest
-    results are stored.
+    effects were added to the library, or the set now follows the runs much better.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -239,12 +236,7 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
         margin = compute_comparison_margin(gain)
         if gain < context.filters.compute_gain(extended.followed) + margin:
             return larger_sets
-        del context.extended_sets[key]
     larger_sets = _compare_larger_sets(context, current)
-    # The oldest results are discarded, but not those for the base model, which are used most.
-    oldest = [known for known in context.extended_sets if known[0]][: -MAX_STORED_EXTENSIONS + 1]
-    for known in oldest:
-        del context.extended_sets[known]
     context.extended_sets[key] = current, larger_sets
     return larger_sets
 

@@ -11,9 +11,9 @@ residual of a set is only noise. The order is:
        following. Otherwise fit the dry friction among them first, because it is not linear where a
        joint sticks (`dry_friction_fits`), and then the set (`simulated_fits`). If this fails, and
        friction acts at all joints, select the other effects with it in the filter's model
-       (`selection_with_friction`).
-       If this fails too, or before it if servos reach their limits, simulate single effects at
-       several coefficients, and fit the best of them (`single_effect_fits`).
+       (`selection_with_friction`). If this fails too, or before it if servos reach their limits,
+       simulate single effects at several coefficients, and fit the best of them
+       (`single_effect_fits`).
     2. If a force is still missing, select again, with effects of many shapes at the joints where it
        is missing (`regression_columns`).
     3. Fit each of the effects with the largest gains alone, and those of the standard joint model

@@ -35,13 +35,12 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 )
 from bench.diagnosis.search.fit_starts import add_effect_to_start
 from bench.diagnosis.search.score_test import DirectionGroup
-from sims.core.simulator import Array
 
 FRICTION_FAMILY = "friction.coulomb@*"
 """Dry friction of all joints."""
 JOINT_MODEL_STEPS = 4
 """Maximum number of Gauss-Newton steps for the coefficients of the standard joint model."""
-MAX_REGRESSIONS = 3
+MAX_RELINEARISATIONS = 3
 """Maximum number of regressions, each about a filter with the effects of the previous ones."""
 
 
@@ -63,7 +62,7 @@ def select_with_friction(context: SearchContext, selected: Selected) -> FittedMo
     if FRICTION_FAMILY not in friction.effects:
         return context.search.base_model
     current = _choose_start(context, friction)
-    for _ in range(MAX_REGRESSIONS):
+    for _ in range(MAX_RELINEARISATIONS):
         larger = _add_selected(context, current)
         if larger is None:
             break
@@ -143,13 +142,14 @@ def _add_selected(context: SearchContext, current: FilteredSet) -> FilteredSet |
     filters = context.filters
     regression, _ = build_regression_about(current, [context.columns.library], current.followed)
     best, first_log_likelihood = current, -np.inf
+    chosen: list[DirectionGroup] = []
     for count in range(1, MAX_SET_SIZE + 1):
-        chosen = [group for group in regression.select(count) if group.effect not in current.names]
-        if len(chosen) < count:
+        chosen = regression.select(count, chosen)
+        # The effects of the set are candidates too, but are not added again.
+        if len(chosen) < count or any(group.effect in current.names for group in chosen):
             break
-        larger = filters.follow_with_effects(
-            *_make_larger(context, current, chosen, regression), steps=0
-        )
+        start = _make_larger(context, current, chosen, regression)
+        larger = filters.follow_with_effects(start.theta, start.effects, steps=0)
         if larger.followed.log_likelihood <= first_log_likelihood:
             break
         first_log_likelihood = larger.followed.log_likelihood
@@ -166,8 +166,8 @@ def _make_larger(
     current: FilteredSet,
     chosen: Sequence[DirectionGroup],
     regression: Regression,
-) -> tuple[Array, tuple[str, ...]]:
-    """Return the parameters (P,) and effects of a set with further effects from a regression.
+) -> FitStart:
+    """Return a set with further effects, whose coefficients come from a regression.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -179,4 +179,4 @@ def _make_larger(
     for group, solution in zip(chosen, regression.solve(chosen).coefficients, strict=True):
         coefficients = context.columns.coefficients(group, solution)
         start = add_effect_to_start(context.evaluator, start, group.effect, coefficients)
-    return start.theta, start.effects
+    return start
