@@ -17,8 +17,9 @@ forces and nu controls.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,68 @@ COLUMNS_PER_BATCH = 256
 
 
 @dataclass(frozen=True)
+class SparseSignals:
+    """Signals of M columns, stored only where they are not zero.
+
+    An effect at one joint of seven acts on one force of seven, and few effects change a reading, so
+    a library would take about twenty times the memory otherwise.
+
+    Attributes:
+        values: (R, T, n) the n signals that are not zero.
+        rows: (n,) index of the force, control or reading that each signal changes.
+        columns: (n,) index of the column of each signal, in ascending order.
+        shape: number of rows, and number M of columns.
+    """
+
+    values: SingleArray
+    rows: IndexArray
+    columns: IndexArray
+    shape: tuple[int, int]
+
+    @classmethod
+    def from_dense(cls, dense: SingleArray) -> SparseSignals:
+        """Take the signals of all rows and columns (R, T, E, M), most of which are zero."""
+        columns, rows = np.nonzero(dense.any(axis=(0, 1)).T)
+        return cls(dense[:, :, rows, columns], rows, columns, (dense.shape[2], dense.shape[3]))
+
+    @classmethod
+    def join(cls, parts: Sequence[SparseSignals]) -> SparseSignals:
+        """Return the columns of all parts, one part after another."""
+        first_columns = np.cumsum([0, *(part.shape[1] for part in parts)])
+        columns = [part.columns + first for part, first in zip(parts, first_columns, strict=False)]
+        return cls(
+            np.concatenate([part.values for part in parts], axis=2),
+            np.concatenate([part.rows for part in parts]),
+            np.concatenate(columns),
+            (parts[0].shape[0], int(first_columns[-1])),
+        )
+
+    def expand(self, begin: int, end: int) -> SingleArray:
+        """Return the signals (R, T, E, end - begin) of consecutive columns, zeros included."""
+        first, last = np.searchsorted(self.columns, [begin, end])
+        dense = np.zeros((*self.values.shape[:2], self.shape[0], end - begin), dtype=np.float32)
+        stored = slice(first, last)
+        dense[:, :, self.rows[stored], self.columns[stored] - begin] = self.values[..., stored]
+        return dense
+
+    def total(self, columns: IndexArray, weights: Array) -> Array:
+        """Return the sum (R, T, E) of n columns, each times its weight.
+
+        Args:
+            columns: (n,) indices of columns, which may occur several times.
+            weights: (n,) their weights.
+        """
+        weight_by_column = np.zeros(self.shape[1])
+        np.add.at(weight_by_column, columns, weights)
+        stored = np.flatnonzero(weight_by_column[self.columns])
+        # Signal of one row each, as a matrix that adds the signals of the same row.
+        to_rows = np.zeros((stored.size, self.shape[0]))
+        to_rows[np.arange(stored.size), self.rows[stored]] = weight_by_column[self.columns[stored]]
+        result: Array = self.values[..., stored] @ to_rows
+        return result
+
+
+@dataclass(frozen=True)
 class Columns:
     """Inputs that candidates add to the states and readings of R runs.
 
@@ -47,25 +110,41 @@ class Columns:
         column_indices: (K,) index of the column of each candidate, which those with the same effect
             share.
         sizes: (K,) scaling coefficient of each probe.
-        pushed: (R, T - 1, E + nu, M) mean forces and controls of M columns between samples.
-        readings: ψ (R, T, C, M).
+        pushed: mean forces and controls (R, T - 1, E + nu) of M columns between samples.
+        readings: ψ (R, T, C) of M columns.
     """
 
     probes: tuple[CandidateDirection, ...]
     column_indices: IndexArray
     sizes: Array
-    pushed: SingleArray
-    readings: SingleArray
+    pushed: SparseSignals
+    readings: SparseSignals
 
     def joined(self, others: Columns) -> Columns:
         """Return the columns of these candidates, followed by those of others."""
         return Columns(
             self.probes + others.probes,
-            np.concatenate([self.column_indices, others.column_indices + self.pushed.shape[3]]),
+            np.concatenate([self.column_indices, others.column_indices + self.pushed.shape[1]]),
             np.concatenate([self.sizes, others.sizes]),
-            np.concatenate([self.pushed, others.pushed], axis=3),
-            np.concatenate([self.readings, others.readings], axis=3),
+            SparseSignals.join([self.pushed, others.pushed]),
+            SparseSignals.join([self.readings, others.readings]),
         )
+
+    def iterate_batches(self) -> Iterator[ColumnBatch]:
+        """Iterate over the columns of the candidates, in batches that fit in the CPU cache."""
+        count = self.pushed.shape[1]
+        for begin in range(0, count, COLUMNS_PER_BATCH):
+            end = min(begin + COLUMNS_PER_BATCH, count)
+            candidates = np.flatnonzero(
+                (self.column_indices >= begin) & (self.column_indices < end)
+            )
+            if candidates.size:
+                yield ColumnBatch(
+                    candidates,
+                    self.column_indices[candidates] - begin,
+                    self.pushed.expand(begin, end),
+                    self.readings.expand(begin, end),
+                )
 
     def subset(self, chosen: Sequence[int]) -> Columns:
         """Return some of the candidates, with the columns of all."""
@@ -94,7 +173,23 @@ class Columns:
         """
         columns = self.column_indices[list(chosen)]
         weights = coefficients / self.sizes[list(chosen)]
-        return self.pushed[..., columns] @ weights, self.readings[..., columns] @ weights
+        return self.pushed.total(columns, weights), self.readings.total(columns, weights)
+
+
+class ColumnBatch(NamedTuple):
+    """Consecutive columns.
+
+    Attributes:
+        candidates: indices of the candidates that have one of these columns.
+        columns: index, among these columns, of the column of each of the candidates.
+        pushed: (R, T - 1, E + nu, m) mean forces and controls of m columns.
+        readings: ψ (R, T, C, m).
+    """
+
+    candidates: IndexArray
+    columns: IndexArray
+    pushed: SingleArray
+    readings: SingleArray
 
 
 def compute_columns(followed: FollowedRuns, probes: Sequence[CandidateDirection]) -> Columns:
@@ -129,7 +224,30 @@ def compute_columns(followed: FollowedRuns, probes: Sequence[CandidateDirection]
             column_by_key[key] = len(effects)
             effects.append((effect, coefficients))
         column_indices.append(column_by_key[key])
-    # Inputs to the states and to the readings, by run.
+    batches = [
+        _compute_inputs(followed, effects[begin : begin + COLUMNS_PER_BATCH])
+        # An empty batch if there are no effects.
+        for begin in range(0, max(len(effects), 1), COLUMNS_PER_BATCH)
+    ]
+    pushed, readings = (SparseSignals.join(parts) for parts in zip(*batches, strict=True))
+    sizes = np.array(
+        [1.0 if p.is_single_size else p.coefficients[p.coefficient_index] for p in probes]
+    )
+    return Columns(tuple(probes), np.array(column_indices, dtype=np.intp), sizes, pushed, readings)
+
+
+def _compute_inputs(
+    followed: FollowedRuns, effects: Sequence[tuple[Effect, Array]]
+) -> tuple[SparseSignals, SparseSignals]:
+    """Compute the inputs that effects add to the states and to the readings.
+
+    Args:
+        followed: the runs, followed by the filter about whose motion the inputs are computed.
+        effects: effects with their coefficients; each has one column.
+
+    Returns:
+        Mean forces and controls between samples, and direct changes of the readings.
+    """
     run_count, samples, channels = followed.runs.residuals.shape
     inputs = followed.runs.inputs.shape[3]
     pushed = np.zeros((run_count, samples - 1, inputs, len(effects)), dtype=np.float32)
@@ -145,14 +263,11 @@ def compute_columns(followed: FollowedRuns, probes: Sequence[CandidateDirection]
     readings[~followed.runs.recorded] = 0.0
     is_finite = np.isfinite(pushed).all(axis=(0, 1, 2)) & np.isfinite(readings).all(axis=(0, 1, 2))
     pushed[..., ~is_finite], readings[..., ~is_finite] = 0.0, 0.0
-    sizes = np.array(
-        [1.0 if p.is_single_size else p.coefficients[p.coefficient_index] for p in probes]
-    )
-    return Columns(tuple(probes), np.array(column_indices, dtype=np.intp), sizes, pushed, readings)
+    return SparseSignals.from_dense(pushed), SparseSignals.from_dense(readings)
 
 
-def compute_responses(followed: FollowedRuns, columns: Columns) -> SingleArray:
-    """Return how a unit of each candidate changes the whitened innovations of the filter.
+def compute_responses(followed: FollowedRuns, columns: Columns, responses: SingleArray) -> None:
+    """Compute how a unit of each candidate changes the whitened innovations of the filter.
 
     The forces, controls and readings that a candidate adds are propagated through the recursion of
     the filter, eq. (1) of the module docstring, with its gains.
@@ -160,23 +275,28 @@ def compute_responses(followed: FollowedRuns, columns: Columns) -> SingleArray:
     Args:
         followed: the R runs, followed by the filter.
         columns: inputs of the K candidates.
-
-    Returns:
-        Whitened responses (R, T, C, K) at T samples of C channels, in units of the candidates'
-        coefficients.
+        responses: array for the whitened responses (R, T, C, K) at T samples of C channels, in
+            units of the candidates' coefficients; it is overwritten.
     """
+    recursion = _FilterRecursion.of(followed)
     inputs = followed.runs.inputs.astype(np.float32)
-    whitened = _propagate_through_filter(followed, columns.pushed, columns.readings, inputs)
-    sizes: SingleArray = columns.sizes.astype(np.float32)
-    result = np.empty((*whitened.shape[:3], sizes.size), dtype=np.float32)
-    # One run at a time, because the arrays of all runs together exceed the CPU cache.
-    for run, values in enumerate(result):
-        np.take(whitened[run], columns.column_indices, axis=2, out=values, mode="clip")
-        with np.errstate(all="ignore"):
-            values /= sizes
-            # A candidate with a divergent motion gets a response of zero.
-            values[~(np.abs(values) < MAX_MAGNITUDE)] = 0.0
-    return result
+    for batch in columns.iterate_batches():
+        whitened = recursion.propagate(batch.pushed, batch.readings, inputs)
+        sizes = columns.sizes[batch.candidates].astype(np.float32)
+        # Slices of consecutive candidates are written several times faster than single ones.
+        breaks = np.flatnonzero(np.diff(batch.candidates) != 1) + 1
+        parts = np.split(np.arange(batch.candidates.size), breaks)
+        # One run at a time, because the arrays of all runs together exceed the CPU cache.
+        for run, values in enumerate(whitened):
+            scaled = np.take(values, batch.columns, axis=2, mode="clip")
+            with np.errstate(all="ignore"):
+                scaled /= sizes
+                # A candidate with a divergent motion gets a response of zero.
+                scaled[~(np.abs(scaled) < MAX_MAGNITUDE)] = 0.0
+            for part in parts:
+                candidates = batch.candidates[part]
+                slots = slice(candidates[0], candidates[-1] + 1)
+                responses[run, ..., slots] = scaled[..., part[0] : part[-1] + 1]
 
 
 def compute_parameter_responses(
@@ -220,16 +340,15 @@ def compute_parameter_responses(
     # A step in which the model diverges gives no information on the next one.
     for values in (pushed, readings):
         values[~(np.abs(values) < MAX_MAGNITUDE)] = 0.0
-    return _propagate_through_filter(followed, pushed, readings)
+    return _FilterRecursion.of(followed).propagate(pushed, readings)
 
 
 def compute_step_error_response(followed: FollowedRuns) -> Array:
     """Return the whitened response (R, T, C) to the errors of the integrator's steps."""
     step_errors = followed.step_errors[..., None].astype(np.float32)
     no_readings = np.zeros((*followed.runs.residuals.shape, 1), dtype=np.float32)
-    response: Array = _propagate_through_filter(followed, step_errors, no_readings)[..., 0].astype(
-        np.float64
-    )
+    recursion = _FilterRecursion.of(followed)
+    response: Array = recursion.propagate(step_errors, no_readings)[..., 0].astype(np.float64)
     return response
 
 
@@ -247,68 +366,75 @@ def compute_sensitivities(
         columns: inputs of the candidates.
         dtype: type of the result.
     """
-    run_count, _, _, count = columns.readings.shape
-    result = np.zeros((*columns.readings.shape[:3], len(columns.probes)), dtype)
-    for begin in range(0, count, COLUMNS_PER_BATCH):
-        batch = slice(begin, min(begin + COLUMNS_PER_BATCH, count))
+    run_count, samples, channels = followed.runs.residuals.shape
+    result = np.zeros((run_count, samples, channels, len(columns.probes)), dtype)
+    for batch in columns.iterate_batches():
         changes = followed.propagate_without_gain(
-            np.zeros((run_count, followed.runs.prior.size, batch.stop - begin)),
-            columns.pushed[..., batch],
-            columns.readings[..., batch],
-        )
-        # Candidates whose columns are in this batch.
-        chosen = np.flatnonzero(
-            (columns.column_indices >= begin) & (columns.column_indices < batch.stop)
+            np.zeros((run_count, followed.runs.prior.size, batch.pushed.shape[3])),
+            batch.pushed,
+            batch.readings,
         )
         with np.errstate(all="ignore"):
-            result[..., chosen] = (
-                changes[..., columns.column_indices[chosen] - begin] / columns.sizes[chosen]
+            result[..., batch.candidates] = (
+                changes[..., batch.columns] / columns.sizes[batch.candidates]
             )
     return result
 
 
-def _propagate_through_filter(
-    followed: FollowedRuns,
-    pushed: SingleArray,
-    readings: SingleArray,
-    inputs: SingleArray | None = None,
-) -> SingleArray:
-    """Propagate columns through the filter, and return the whitened responses (R, T, C, M).
+class _FilterRecursion(NamedTuple):
+    """Matrices of the recursion of a filter, in single precision.
 
-    The recursion is s[i+1] = A (s[i] - K u[i]) + b[i] with u = H s + ψ, where s is the change of
-    the predicted state and K the gain of the filter: part of a change of the state is corrected by
-    the next reading. The whitened response is W u. It is eq. (1) of the module docstring, for all M
-    columns in single precision, in batches that fit in the CPU cache.
-
-    Args:
-        followed: the R runs, followed by the filter, with matrices A, H, K and W.
-        pushed: (R, T - 1, E + nu, M) forces and controls, or states if `inputs` is None.
-        readings: ψ (R, T, C, M).
-        inputs: (R, T - 1, Z, E + nu) matrices that map `pushed` to b.
+    Attributes:
+        states, readings, gains, whiteners: A, H, K and W of each run and sample.
+        size: number of states of the robot, before those of coloured noise.
     """
-    coloured, _ = add_noise_states(followed.runs, followed.noise)
-    run_count, samples, channels, count = readings.shape
-    # Candidates act on the states of the robot, and not on those of coloured noise after them.
-    size = followed.runs.prior.size
-    responses = np.zeros((run_count, samples, channels, count), dtype=np.float32)
-    h, a = coloured.readings.astype(np.float32), coloured.states.astype(np.float32)
-    gains = followed.filtered.gains.astype(np.float32)
-    whiteners = followed.filtered.whiteners.astype(np.float32)
-    with np.errstate(all="ignore"):
-        for first_column in range(0, count, COLUMNS_PER_BATCH):
-            batch_columns = slice(first_column, min(first_column + COLUMNS_PER_BATCH, count))
-            s = np.zeros(
-                (run_count, a.shape[2], batch_columns.stop - batch_columns.start),
-                dtype=np.float32,
-            )
+
+    states: SingleArray
+    readings: SingleArray
+    gains: SingleArray
+    whiteners: SingleArray
+    size: int
+
+    @classmethod
+    def of(cls, followed: FollowedRuns) -> _FilterRecursion:
+        """Return the recursion of the filter of the R runs."""
+        coloured, _ = add_noise_states(followed.runs, followed.noise)
+        return cls(
+            coloured.states.astype(np.float32),
+            coloured.readings.astype(np.float32),
+            followed.filtered.gains.astype(np.float32),
+            followed.filtered.whiteners.astype(np.float32),
+            followed.runs.prior.size,
+        )
+
+    def propagate(
+        self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None
+    ) -> SingleArray:
+        """Propagate columns through the filter, and return the whitened responses (R, T, C, m).
+
+        The recursion is s[i+1] = A (s[i] - K u[i]) + b[i] with u = H s + ψ, where s is the change
+        of the predicted state and K the gain of the filter: part of a change of the state is
+        corrected by the next reading. The whitened response is W u. It is eq. (1) of the module
+        docstring, for all m columns in single precision.
+
+        Args:
+            pushed: (R, T - 1, E + nu, m) forces and controls, or states if `inputs` is None.
+            readings: ψ (R, T, C, m).
+            inputs: (R, T - 1, Z, E + nu) matrices that map `pushed` to b.
+        """
+        samples = readings.shape[1]
+        responses = np.zeros_like(readings)
+        s = np.zeros((len(readings), self.states.shape[2], readings.shape[3]), dtype=np.float32)
+        with np.errstate(all="ignore"):
             for i in range(samples):
-                u = h[:, i] @ s
-                u += readings[:, i, :, batch_columns]
-                np.matmul(whiteners[:, i], u, out=responses[:, i, :, batch_columns])
+                u = self.readings[:, i] @ s
+                u += readings[:, i]
+                np.matmul(self.whiteners[:, i], u, out=responses[:, i])
                 if i + 1 < samples:
-                    s -= gains[:, i] @ u
-                    s = a[:, i] @ s
-                    added = pushed[:, i, :, batch_columns]
-                    s[:, :size] += added if inputs is None else inputs[:, i] @ added
-    responses[~np.isfinite(responses)] = 0.0
-    return responses
+                    s -= self.gains[:, i] @ u
+                    s = self.states[:, i] @ s
+                    added = pushed[:, i]
+                    # Candidates act on the states of the robot, not on those of coloured noise.
+                    s[:, : self.size] += added if inputs is None else inputs[:, i] @ added
+        responses[~np.isfinite(responses)] = 0.0
+        return responses

@@ -654,14 +654,15 @@ def regress(
         always: indices of probes that are part of every set, and are not candidates.
     """
     # Shapes: R runs, T samples, C channels, K candidates; the arrays of a run have rows T C.
-    responses = np.concatenate(
-        [
-            *(compute_responses(followed, part) for part in columns),
-            compute_step_error_response(followed)[..., None].astype(np.float32),
-        ],
-        axis=3,
-    )
-    run_count, _, _, count = responses.shape
+    run_count, samples, channels = followed.runs.residuals.shape
+    count = sum(len(part.probes) for part in columns) + 1
+    responses = np.empty((run_count, samples, channels, count), dtype=np.float32)
+    first = 0
+    for part in columns:
+        end = first + len(part.probes)
+        compute_responses(followed, part, responses[..., first:end])
+        first = end
+    responses[..., -1] = compute_step_error_response(followed)
     rows = responses.reshape(run_count, -1, count)
     # Coefficients of the columns that are in the linear model.
     weights = np.zeros(count)
@@ -675,10 +676,10 @@ def regress(
     }
     probes = [probe for part in columns for probe in part.probes]
     groups = [g for g in group_probes(probes) if not set(g.column_indices) & set(always)]
-    samples = int(followed.runs.recorded.sum())
+    readings = int(followed.runs.recorded.sum())
     products = ResponseProducts(list(rows), list(innovations))
     only_proposed = frozenset(i for i, probe in enumerate(probes) if probe.is_only_proposed)
-    return Regression(groups, products, samples, contains, (count - 1, *always), only_proposed)
+    return Regression(groups, products, readings, contains, (count - 1, *always), only_proposed)
 
 
 def follow_linear_with_effects(
