@@ -335,7 +335,8 @@ def fit_process_noise(
         typical: (E,) typical forces in N or N·m; a small share of them is the minimum.
 
     Returns:
-        The standard deviations (E,), and the results of filter and smoother with them.
+        The standard deviations (E,), and the results of filter and smoother with them, without the
+        covariances of the states.
     """
     count = force.size
     # Short segments in parallel need fewer steps, and show the same process noise.
@@ -354,7 +355,9 @@ def fit_process_noise(
     if is_long:
         filtered = filter_runs(runs, force, white)
         smoothed = smooth_runs(runs, filtered, force)
-    return force, filtered, smoothed
+    # A third of the memory of a filter, which only the smoother needs.
+    no_covariances = np.zeros((len(filtered.covariances), 0, 0, 0))
+    return force, replace(filtered, covariances=no_covariances), smoothed
 
 
 def _make_contiguous(*arrays: Array) -> tuple[Array, ...]:

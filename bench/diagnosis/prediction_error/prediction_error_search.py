@@ -603,8 +603,10 @@ class PredictionErrorSearch(EffectSearch):
     def get_known_directions(self) -> tuple[TrajectoryFit, DirectionSet] | None:
         """Return the fit of the base model, and first-order changes of its runs by every candidate.
 
-        They are linearised about the measured motion.
+        They are linearised about the measured motion. The regressions are released first: the
+        report asks for directions last, and both together would need the most memory.
         """
+        self._search_context.columns.release_regressions()
         library = self._search_context.columns.library
         base = self._search_context.filters.base
         values = compute_sensitivities(base, library, np.float32)

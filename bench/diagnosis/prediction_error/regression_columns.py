@@ -7,7 +7,7 @@ the model.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -68,7 +68,7 @@ class LibraryColumns:
     _library: Columns | None = None
     _base_regression: tuple[Columns, Regression] | None = None
     _hats: Columns | None = None
-    _regressions: dict[tuple[str, ...], tuple[Array, ModelRegression]] = field(default_factory=dict)
+    _newest: tuple[FittedModel, ModelRegression] | None = None
 
     @property
     def library(self) -> Columns:
@@ -182,21 +182,24 @@ class LibraryColumns:
 
         The candidates are the library and forces of any shape. The derivatives by the coefficients
         of the model are part of every set, so that a regression about nearly the same coefficients
-        gives the same gains to first order. A regression about the same effects is therefore cached
-        and reused if no parameter differs by more than the share `RELATIVE_DIFFERENCE`.
+        gives the same gains to first order. The newest regression is therefore reused for the same
+        effects if no parameter differs by more than the share `RELATIVE_DIFFERENCE`.
 
         Args:
             model: the fitted model.
         """
-        theta, names = model.fit.theta, model.effects
-        if names in self._regressions:
-            known, regression = self._regressions[names]
-            if (np.abs(theta - known) <= RELATIVE_DIFFERENCE * np.abs(known)).all():
-                return regression
-        current = FilteredSet(self.filters.get_filter(model), names)
+        if self._newest is not None and _has_similar_parameters(model, self._newest[0]):
+            return self._newest[1]
+        # A regression is large, so that the last one goes before the next one is made.
+        self._newest = None
+        current = FilteredSet(self.filters.get_filter(model), model.effects)
         regression = build_regression_about(current, [self.library, self.hats], self.filters.base)
-        self._regressions[names] = theta, regression
+        self._newest = model, regression
         return regression
+
+    def release_regressions(self) -> None:
+        """Release the memory of the regressions, which are made again if they are needed."""
+        self._newest = self._base_regression = None
 
     def sensitivities(self, start: FitStart) -> KnownJacobian:
         """Return the derivatives of the runs by the coefficients of a model's effects.
@@ -225,6 +228,14 @@ class LibraryColumns:
             indices += evaluator.get_coefficient_indices(name)
             first_column += 1 + len(displaced)
         return KnownJacobian(np.array(indices, dtype=np.intp), np.stack(derivatives, axis=-1))
+
+
+def _has_similar_parameters(model: FittedModel, other: FittedModel) -> bool:
+    """Return whether two models have the same effects and nearly the same parameters."""
+    theta, other_theta = model.fit.theta, other.fit.theta
+    tolerance = RELATIVE_DIFFERENCE * np.abs(other_theta)
+    is_similar = bool((np.abs(theta - other_theta) <= tolerance).all())
+    return model.effects == other.effects and is_similar
 
 
 def list_probes(
