@@ -156,12 +156,15 @@ def read_integrator_settings(robot: RobotModel) -> IntegratorSettings:
 
 
 def specifies_integrator(robot: RobotModel) -> bool:
-    """Return whether the robot's model file specifies the time step and the integrator.
+    """Return whether the user specified the time step and the integrator of the robot.
 
     An MJCF always does, since values that it omits are MuJoCo's defaults. A URDF describes the
-    robot alone, unless it contains options of MuJoCo other than the defaults.
+    robot alone, unless it contains options of MuJoCo other than the defaults, or the table
+    ``[engine]`` of the recording states them.
     """
-    return robot.format == "mjcf" or read_integrator_settings(robot) != DEFAULT_SETTINGS
+    is_stated = bool({"timestep", "integrator"} & set(robot.engine_table))
+    is_default = read_integrator_settings(robot) == DEFAULT_SETTINGS
+    return robot.format == "mjcf" or is_stated or not is_default
 
 
 class EngineTable(TypedDict, total=False):
