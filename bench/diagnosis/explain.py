@@ -212,7 +212,7 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
                 segment_duration,
             )
         model = option_choice.choose(model)
-        if option_choice.finding is None and model.shows_step_errors():
+        if option_choice.finding is None:
             model = step_choice.choose(model)
         return model.finish()
 

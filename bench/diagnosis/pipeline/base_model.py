@@ -35,11 +35,6 @@ MIN_REFITTED_RESIDUAL = 1.05
 """Minimum RMS residual, in units of the noise, at which first states are fitted again."""
 MIN_UNFOLLOWED_RESIDUAL = 3.0
 """Minimum RMS residual, in units of the noise, of whole runs that are cut into segments."""
-MIN_LARGE_ERROR_COEFFICIENT = 0.2
-"""Minimum coefficient of the response to step errors for which finer steps are simulated.
-
-Euler's method with the servo of an arm, whose steps miss by 3.5 times the noise, has 0.27.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +117,7 @@ class BaseModel:
     def shows_step_errors(self) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps.
 
-        Without a filter of the runs this is not known, and true is returned. The response to the
-        errors is linear in the step, and a large error is not, so that a small coefficient counts;
-        `TimeStepChoice.choose` simulates finer steps before it uses one.
+        Without a filter of the runs this is not known, and true is returned.
         """
         runs = self.runs
         if runs.fitting.filtered_runs is None or not self.is_usable:
@@ -134,8 +127,7 @@ class BaseModel:
         from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
 
         theta = self.fit.fit.theta
-        followed = FollowedRuns.get_or_follow(runs.fitting, theta, runs.noise)
-        return shows_step_errors(followed, MIN_LARGE_ERROR_COEFFICIENT)
+        return shows_step_errors(FollowedRuns.get_or_follow(runs.fitting, theta, runs.noise))
 
     def correct_step_errors(self) -> BaseModel:
         """Return the base model without the discretisation error of the engine's steps.

@@ -30,6 +30,14 @@ MIN_CLOSED_SHARE = 0.5
 """Minimum share of the base model's gap that a finer step must close alone to be used in the
 search. With a smaller share, another missing effect decides which step looks better.
 """
+MIN_TESTED_EXCESS = 0.5
+"""Minimum excess RMS residual, in units of the noise, for which errors of the step are simulated
+although the innovations do not show them.
+"""
+MIN_ERROR_SHARE = 0.3
+"""Minimum simulated error of the step, as a share of the residual, for which finer ones are tried
+although the innovations do not show it.
+"""
 MAX_SUBSET_EFFECTS = 3
 """Maximum number of effects of which all subsets are fitted with another time step."""
 REFIT_ITERATIONS = 8
@@ -56,9 +64,11 @@ class TimeStepChoice:
     def choose(self, model: BaseModel) -> BaseModel:
         """Choose the step of the base model: the file's own, or a finer one.
 
-        A finer step is used if it alone closes a large part of the gap. Steps are tried from coarse
-        to fine; a step must be so accurate that its error is far below the residual that remains
-        with it.
+        Finer steps are tried if the innovations show errors of the step, or if simulated errors are
+        a large part of the residual: the linear response to the errors of a stiff servo may be
+        wrong. A finer step is used if it alone closes a large part of the gap. Steps are tried from
+        coarse to fine; a step must be so accurate that its error is far below the residual that
+        remains with it.
 
         Args:
             model: base model with the file's own step.
@@ -67,10 +77,19 @@ class TimeStepChoice:
         from bench.diagnosis.evaluation.discretisation_error import find_step_refinements
 
         runs = model.runs
-        # Copies of a tee share the refinements that were simulated, for `reconsider`.
-        (self._refinements,) = tee(find_step_refinements(runs.fitting, runs.noise), 1)
         file_log_likelihood, residual_rms = model.rate()
         file_excess = residual_rms - 1.0
+        shows_errors = model.shows_step_errors()
+        if not shows_errors and not file_excess > MIN_TESTED_EXCESS:
+            return model
+        # Copies of a tee share the refinements that were simulated, for `reconsider`.
+        (refinements,) = tee(find_step_refinements(runs.fitting, runs.noise), 1)
+        first = next(copy(refinements), None)
+        if first is None:
+            return model
+        if not shows_errors and not first.error > MIN_ERROR_SHARE * residual_rms:
+            return model
+        self._refinements = refinements
         # The error of a step must be far below `residual_rms`, the residual that remains with the
         # last step tried. Finer steps leave a smaller one.
         for refinement in copy(self._refinements):

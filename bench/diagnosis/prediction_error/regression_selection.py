@@ -152,17 +152,11 @@ class Regression:
         group = DirectionGroup("", tuple(own), (False,) * len(own))
         return self.compute_log_ratio(self.solve([]).rss, self.solve([group]).rss)
 
-    def shows_nuisance(
-        self, chosen: Sequence[DirectionGroup], min_coefficient: float = 0.5
-    ) -> bool:
+    def shows_nuisance(self, chosen: Sequence[DirectionGroup]) -> bool:
         """Return whether the data show the first column of `always`, in addition to a set.
 
-        That column is the response to the integrator's step errors, and must improve the fit.
-
-        Args:
-            chosen: the set.
-            min_coefficient: smallest coefficient of the column. The full error has one; half of it
-                is nearer to one than to zero.
+        That column is the response to the integrator's step errors. Its coefficient must be nearer
+        to one (the full error) than to zero, and it must improve the fit.
         """
         # The other columns of `always` are in both fits.
         others = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
@@ -170,7 +164,7 @@ class Regression:
         rss_without = self._fit_groups([*chosen, others]).rss
         # The nuisance group is the last one; its first column is meant.
         return (
-            float(coefficients[-1][0]) > min_coefficient
+            float(coefficients[-1][0]) > 0.5
             and self.compute_log_ratio(rss_without, rss_with) > MIN_VISIBLE_GAIN
         )
 
@@ -578,17 +572,12 @@ class Selected:
         return [group.effect for group in self.groups]
 
 
-def shows_step_errors(followed: FollowedRuns, min_coefficient: float = 0.5) -> bool:
+def shows_step_errors(followed: FollowedRuns) -> bool:
     """Return whether the innovations show the errors of the integrator's steps.
 
     They do if the recorded motion is one of continuous time, and do not if the engine generated it.
-
-    Args:
-        followed: the runs, followed by a filter.
-        min_coefficient: smallest coefficient of the response to the step errors.
     """
-    regression = regress(followed, [compute_columns(followed, [])])
-    return regression.shows_nuisance([], min_coefficient)
+    return regress(followed, [compute_columns(followed, [])]).shows_nuisance([])
 
 
 def identify(followed: FollowedRuns, columns: Columns, first: Regression | None = None) -> Selected:

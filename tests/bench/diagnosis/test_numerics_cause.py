@@ -10,8 +10,7 @@ import pytest
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.explain import explain
 from bench.diagnosis.explain_options import ExplainOptions
-from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.pipeline.base_model import BaseModel
+from bench.diagnosis.pipeline.base_model import filter_and_fit
 from bench.diagnosis.pipeline.recording_preparation import prepare_runs
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext
 from bench.diagnosis.pipeline.time_step_choice import (
@@ -29,12 +28,12 @@ UNITS = dict.fromkeys(("u.m_shoulder", "u.m_elbow", "q.shoulder", "q.elbow"), "r
 NOISE, EVERY, SAMPLES = 3e-4, 2, 375
 
 
-def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler"):
+def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler", arm=ARM):
     """Write a log of a changed arm, simulated with the step of the file or a part of it.
 
     The step of the file misses the fine motion by 7 times this noise.
     """
-    model = mujoco.MjModel.from_xml_string(ARM.replace(*change) if change[0] else ARM)
+    model = mujoco.MjModel.from_xml_string(arm.replace(*change) if change[0] else arm)
     step = model.opt.timestep
     model.opt.timestep /= divide
     model.opt.integrator = int(getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}"))
@@ -45,7 +44,7 @@ def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler"):
         readings = follow(model, commands, EVERY * divide)
         runs.append((times, commands, readings + noise * rng.standard_normal(readings.shape)))
     description = describe(UNITS, noise or None, "[runs.3]\nheld_out = true\n")
-    return write_log(folder, description, ",".join(UNITS), runs, arm=ARM)
+    return write_log(folder, description, ",".join(UNITS), runs, arm=arm)
 
 
 URDF = """<robot name="arm">
@@ -79,9 +78,8 @@ def chosen(path):
     """Return the choice of the step of a log after the base fit, and the runs with this step."""
     context = DiagnosisContext(ExplainOptions(), ForkedWorkerPool(1))
     with closing(context):
-        runs = prepare_runs([path], context)
         choice = TimeStepChoice()
-        model = choice.choose(BaseModel(runs, fit_base_model(runs.fitting, runs.noise)))
+        model = choice.choose(filter_and_fit(prepare_runs([path], context)))
     return choice, model.runs
 
 
@@ -99,6 +97,22 @@ def test_a_step_that_is_the_only_thing_wrong_is_found_before_any_cause(tmp_path)
     assert choice.finding is not None
     assert choice.finding.gain > MIN_FINER_STEP_GAIN
     assert runs.kind.numerics.integrator == "RK4"
+
+
+def test_a_step_is_found_although_the_innovations_do_not_show_its_errors(tmp_path):
+    # Stiffer dampers: the linear response to the errors has the coefficient 0.02.
+    arm = ARM.replace('kv="6"', 'kv="12"').replace('kv="2"', 'kv="4"')
+    choice, runs = chosen(log(tmp_path, divide=4, integrator="RK4", arm=arm))
+    assert choice.finding is not None
+    assert runs.kind.numerics.integrator == "RK4"
+
+
+def test_a_table_of_the_recording_states_the_step_of_a_urdf(tmp_path):
+    path = describe_by_urdf(log(tmp_path, divide=4, integrator="RK4"))
+    description = path.with_suffix(".toml")
+    engine = '[engine]\ntimestep = 0.002\nintegrator = "Euler"\n'
+    description.write_text(description.read_text() + engine)
+    assert chosen(path)[0].finding is not None
 
 
 def test_a_urdf_has_no_step_that_could_be_wrong(tmp_path):
