@@ -186,16 +186,16 @@ class _IdentifiabilityAssessment:
 
         What a change of the initial states could explain gives no information on a parameter. The
         prior of the initial states limits their change: it is added to the normal equations of the
-        least-squares fit of each column by the derivatives `states` (R, n, s).
+        least-squares fit of each column by the derivatives `states` (R, n, s). An unstable motion
+        has nearly parallel derivatives, which the scaled inverse allows.
 
         Shapes: R runs, n samples times channels of a run, s states of a run.
         """
         state_jacobian = self.states
         precision = np.diag(compute_state_prior(self.evaluator) ** -2.0)
         normal = np.matmul(state_jacobian.transpose(0, 2, 1), state_jacobian) + precision
-        coefficients = np.linalg.solve(
-            normal, np.matmul(state_jacobian.transpose(0, 2, 1), columns)
-        )
+        inverse = np.array([invert_scaled(of_run, of_run) for of_run in normal])
+        coefficients = inverse @ np.matmul(state_jacobian.transpose(0, 2, 1), columns)
         projected: Array = columns - np.matmul(state_jacobian, coefficients)
         runs, samples, count = projected.shape
         return projected.reshape(runs * samples, count)

@@ -373,8 +373,9 @@ def _confirm_by_filter(
 ) -> FitStart | None:
     """Return the start of a competing model that a filter confirms, else None.
 
-    A filter with the effect in its model improves the coefficients by Gauss-Newton steps, unless
-    there are many, and its log-likelihood must come close to that of the best model.
+    A filter with the effect in its model improves the coefficients by Gauss-Newton steps, and its
+    log-likelihood must come close to that of the best model. Many coefficients are improved only if
+    the loss is within the error of the linear regression, as for a family of the same forces.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -384,7 +385,9 @@ def _confirm_by_filter(
     """
     filters = context.filters
     has_few = competing_effect.coefficients.size <= MAX_IMPROVED_SIZE
-    steps = GAUSS_NEWTON_STEPS if has_few else 0
+    gain = filters.compute_gain(filters.get_filter(best))
+    is_near = competing_effect.loss <= compute_comparison_margin(gain)
+    steps = GAUSS_NEWTON_STEPS if has_few or is_near else 0
     # Better coefficients do not help an effect with which the filter follows the runs worse.
     if (
         len(start.effects) == 1
