@@ -124,7 +124,11 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     return select_likeliest(fit_competing_models(context, single), best)
 
 
-def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedModel:
+def fit_competing_models(
+    context: SearchContext,
+    best: FittedModel,
+    compared: frozenset[frozenset[str]] = frozenset(),
+) -> FittedModel:
     """Fit the sets that are nearly as good by the regression, and return the best of all.
 
     Each effect of the best model is replaced in turn by the effects that a regression finds nearly
@@ -135,11 +139,14 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
     Args:
         context: search, filters and regressions of the recording.
         best: the best model so far.
+        compared: sets of effects whose competitors were fitted before. A family may be likelier
+            than its only member that acts, which is preferred; the comparison ends there.
 
     Returns:
         The fitted model with the highest penalised log-likelihood among those with as many effects
         as `best`; `best` itself if it has no effects or series joints.
     """
+    compared |= {frozenset(best.effects)}
     search, evaluator = context.search, context.evaluator
     has_no_fit = not best.effects or not np.isfinite(best.fit.cost)
     if has_no_fit or has_series(evaluator, best.effects):
@@ -166,12 +173,15 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
     preferred = search.get_best(size) or best
     merged = _replace_two_effects(context, preferred)
     if merged is not None:
-        return fit_competing_models(context, merged)
+        return fit_competing_models(context, merged, compared)
     if set(preferred.effects) == set(best.effects):
         return preferred
     # A family may replace another one, and a single member of it may be enough. About a better
     # model, effects that act alike have better starts.
-    return fit_competing_models(context, remove_idle_effects(context, preferred))
+    simplified = remove_idle_effects(context, preferred)
+    if frozenset(simplified.effects) in compared:
+        return simplified
+    return fit_competing_models(context, simplified, compared)
 
 
 def _should_fit(

@@ -7,7 +7,11 @@ import pytest
 
 from bench.diagnosis import identifiability
 from bench.diagnosis.explain import explain
-from bench.diagnosis.identifiability import check_identifiability, format_identifiability
+from bench.diagnosis.identifiability import (
+    _IdentifiabilityAssessment,
+    check_identifiability,
+    format_identifiability,
+)
 from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
@@ -108,3 +112,18 @@ def test_of_many_causes_the_surest_are_listed_and_the_others_counted(tmp_path, m
     assert lines[6].endswith(" more")
     assert lines[-1].endswith("the same command with --json")
     assert len("\n".join(lines)) < 1500
+
+
+def test_parallel_derivatives_of_an_unstable_motion_are_projected_out(monkeypatch):
+    """Each unstable motion of a run is nearly the same, whatever state was changed."""
+    rng = np.random.default_rng(5)
+    growth = np.exp(np.linspace(0.0, 40.0, 60))[:, None]
+    states = np.repeat(growth, 2, axis=1)[None] * np.array([1.0, 1.0 + 1e-15])
+    assessment = object.__new__(_IdentifiabilityAssessment)
+    assessment.states, assessment.evaluator = states, None
+    monkeypatch.setattr(identifiability, "compute_state_prior", lambda _: np.ones(2))
+    columns = rng.normal(size=(1, 60, 3))
+    projected = assessment._project_out_states(columns)
+    unit = growth[:, 0] / np.linalg.norm(growth)
+    expected = columns[0] - np.outer(unit, unit @ columns[0])
+    np.testing.assert_allclose(projected, expected, atol=1e-3)

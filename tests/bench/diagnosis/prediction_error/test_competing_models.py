@@ -72,6 +72,51 @@ def test_a_competing_effect_is_simulated_at_several_coefficients(
     assert len(rounds) == len(expected), "a second round only if the first one found none"
 
 
+def test_a_comparison_ends_between_a_family_and_its_only_acting_member(monkeypatch):
+    """The family is likelier, its member needs fewer coefficients, and each leads to the other."""
+    member, family = (
+        SimpleNamespace(effects=(name,), fit=SimpleNamespace(cost=1.0))
+        for name in ("inertia.scale@link", "inertia.scale@*")
+    )
+    for name in ("_find_competing_effects", "_fit_at_related_places", "_refine_near"):
+        monkeypatch.setattr(competing_models, name, lambda *_: [])
+    monkeypatch.setattr(competing_models, "has_series", lambda *_: False)
+    monkeypatch.setattr(competing_models, "_replace_two_effects", lambda *_: None)
+    monkeypatch.setattr(competing_models, "remove_idle_effects", lambda *_: member)
+    context = SimpleNamespace(
+        search=SimpleNamespace(get_best=lambda _: family),
+        evaluator=None,
+        filters=SimpleNamespace(
+            base=SimpleNamespace(runs=SimpleNamespace(jumps=np.zeros(1, dtype=bool)))
+        ),
+    )
+    assert competing_models.fit_competing_models(context, member) is member
+
+
+@pytest.mark.parametrize(("loss", "steps"), [(146.0, 2), (5000.0, 0)])
+def test_many_coefficients_are_improved_where_the_regression_cannot_decide(loss, steps):
+    """The linear regression is wrong by up to 3 % of the gain of the best model, here 20,000."""
+    given = []
+
+    def follow_with_effects(theta, names, number=0):
+        given.append(number)
+        return SimpleNamespace(log_likelihood=10_000.0, theta=theta), names
+
+    best_filter = SimpleNamespace(log_likelihood=10_000.0)
+    filters = SimpleNamespace(
+        base=SimpleNamespace(log_likelihood=0.0),
+        log_likelihood=lambda _: 9_900.0,
+        get_filter=lambda _: best_filter,
+        compute_gain=lambda followed: 2.0 * followed.log_likelihood,
+        follow_with_effects=follow_with_effects,
+    )
+    competing = competing_models._CompetingEffect("drag.linear@*", np.ones(7), loss)
+    start = FitStart(("drag.linear@*", "mass.scale@link"), np.ones(8), np.zeros((1, 14)))
+    context = SimpleNamespace(filters=filters)
+    assert competing_models._confirm_by_filter(context, None, competing, start) is not None
+    assert given == [steps]
+
+
 def test_one_effect_replaces_two_that_imitate_it(tmp_path):
     """More armature and more damping of a free pendulum are exactly less gravity."""
     model = mujoco.MjModel.from_xml_string(PENDULUM)
