@@ -21,7 +21,8 @@ residual of a set is only noise. The order is:
     4. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
        filters with the effect in the model (`forward_selection_by_filters`).
     5. Try one effect in place of several (`competing_models`).
-    6. Simulate elasticity and backlash between a drive and its links (`single_effect_fits`).
+    6. Simulate elasticity and backlash between a drive and its links (`single_effect_fits`). Those
+       that remove most of the residual without being fitted come before 3.
 
 If a long recording shows that the model stays incomplete, filters alone identify its effects
 (`identification_without_simulation`), and nothing of the above is done.
@@ -211,9 +212,10 @@ class PredictionErrorSearch(EffectSearch):
         4. dry friction alone, then the set that regression selects, then the set that regressions
            with dry friction of all joints in the model select;
         5. effects with many shapes, such as forces of any period;
-        6. effects that regression missed: singly, then one by one in addition to others;
-        7. one effect in place of several;
-        8. series effects (elastic or slack transmissions).
+        6. series effects (elastic or slack transmissions) that remove most of the residual;
+        7. effects that regression missed: singly, then one by one in addition to others;
+        8. one effect in place of several;
+        9. all other series effects.
 
         If no effect was accepted, the selected set is fitted whole. The functions named ``check_``,
         and `compare_friction_forms`, end the search by raising `SoftFrictionError` if dry friction
@@ -256,6 +258,9 @@ class PredictionErrorSearch(EffectSearch):
             selected_with_shapes = context.columns.select_with_shapes(selected)
             best = select_likeliest(best, fit_quick_selection(context, selected_with_shapes))
             check_simple_friction(context, best)
+        if self._should_continue(best):
+            likely_series = fit_series_effects(context, selected_with_shapes, is_only_likely=True)
+            best = select_likeliest(best, likely_series)
         if self._should_continue(best):
             best = self._add_missing_effects(best, selected, friction)
         best = fit_single_in_place(context, best)

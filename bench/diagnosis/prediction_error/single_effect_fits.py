@@ -55,6 +55,8 @@ MAX_NEARBY = 5
 """Maximum number of effects that are simulated at nearby coefficients, those that fit best."""
 MAX_REFINED = 3
 """Maximum number of effects that are fitted alone to convergence."""
+SMALLER_SERIES_SHARES = (0.1, 0.35)
+"""Shares of the smallest trial compliance or gap that are tried too."""
 MAX_IMPROVED_SIZE = 3
 """Maximum number of coefficients of an effect that is refined alone or improved by a filter."""
 
@@ -255,36 +257,67 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
     return best
 
 
-def fit_series_effects(context: SearchContext, selected: Selected) -> FittedModel:
-    """Fit elastic joints and backlash between drive and links at the most affected joint.
+def fit_series_effects(
+    context: SearchContext, selected: Selected, is_only_likely: bool = False
+) -> FittedModel:
+    """Fit elastic joints and backlash between drive and links at the most affected joints.
 
     These effects have their own states, so a regression cannot score them. Each of their trial
     coefficients is simulated; the best of each effect is fitted; the likeliest is fitted to
-    convergence.
+    convergence. The joints are the most affected ones without any effect and with the selected
+    ones, which may be wrong. Effects that were fitted before are left out.
 
     Args:
         context: search, filters and regressions of the recording.
-        selected: the selection, whose missing forces determine the joint.
+        selected: the selection, whose missing forces determine one of the joints.
+        is_only_likely: whether to fit only effects that remove most of the residual without being
+            fitted.
 
     Returns:
         The fitted model, whether or not it is good; the base model if there are no such effects.
     """
     evaluator, search = context.evaluator, context.search
-    joints = selected.followed.joints_by_loss[:1]
+    joints = {followed.joints_by_loss[0] for followed in (context.filters.base, selected.followed)}
     names = [
-        name for name in evaluator.library if is_series_effect(evaluator.available_effects[name])
+        name
+        for name in evaluator.library
+        if is_series_effect(evaluator.available_effects[name])
+        and acts_at_joint(evaluator, name, joints)
+        and frozenset([name]) not in search.models
     ]
-    probes = context.columns.probes(
-        [name for name in names if acts_at_joint(evaluator, name, joints)]
-    )
-    if not probes:
+    starts = [start for name in names for start in _list_series_starts(context, name)]
+    if not starts:
         return search.base_model
     evaluator.search_control.begin_stage(
-        "testing elasticity and backlash between drives and links", len(probes)
+        "testing elasticity and backlash between drives and links", len(starts)
     )
-    starts = []
-    for probe in probes:
-        theta = context.filters.make_theta_with(probe.effect, probe.coefficients)
-        starts.append(FitStart((probe.effect,), theta, evaluator.initial_state_guesses))
-    fitted = search.fit_all([start for _, start in select_lowest_of_each(context, starts)])
+    share = MAX_SINGLE_SQUARES_SHARE if is_only_likely else np.inf
+    limit = share * search.base_model.fit.cost
+    lowest = [start for cost, start in select_lowest_of_each(context, starts) if cost < limit]
+    if not lowest:
+        return search.base_model
+    fitted = search.fit_all(lowest)
     return fit_by_simulation(context, select_likeliest(*fitted).fit.make_start())
+
+
+def _list_series_starts(context: SearchContext, name: str) -> list[FitStart]:
+    """Return starts with the trial coefficients of an effect between a drive and its link.
+
+    A fit from a much larger gap than the true one ends in a local minimum, so that shares of the
+    smallest trial coefficient are added to the probes.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        name: name of the effect; its first coefficient is a compliance or a gap.
+    """
+    probes = [probe.coefficients for probe in context.columns.probes([name])]
+    smallest = min(probes, key=lambda coefficients: float(coefficients[0]))
+    for share in SMALLER_SERIES_SHARES:
+        smaller = smallest.copy()
+        smaller[0] *= share
+        probes.append(smaller)
+    states = context.evaluator.initial_state_guesses
+    return [
+        FitStart((name,), context.filters.make_theta_with(name, coefficients), states)
+        for coefficients in probes
+    ]
