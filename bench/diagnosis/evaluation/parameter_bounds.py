@@ -32,6 +32,8 @@ Stronger friction only sticks, and sticking divides the steps of the engine.
 """
 INVERSE_FORCE_UNITS = ("1/N", "1/(N")
 """Units of coefficients of terms that grow faster than linearly with a force."""
+VISCOUS_UNITS = ("N*s/m", "N*m*s/rad")
+"""Units of coefficients of terms that grow with the speed."""
 MIN_CYCLES_PER_RUN = 1.0
 """Minimum number of cycles of a periodic effect within the longest run.
 
@@ -190,9 +192,12 @@ def _compute_fit_bounds(
     if parameter.unit == "s":
         # Delays longer than a run look constant within it.
         return max(MAX_RANGE_FACTOR * low, -longest_run), min(MAX_RANGE_FACTOR * high, longest_run)
-    # A term that grows with the square of a force does not cause sticking by itself.
-    is_dry_friction = isinstance(effect, Friction) and not parameter.unit.startswith(
-        INVERSE_FORCE_UNITS
+    # A term that grows with the square of a force does not cause sticking by itself, nor does one
+    # that grows with the speed.
+    is_dry_friction = (
+        isinstance(effect, Friction)
+        and not parameter.unit.startswith(INVERSE_FORCE_UNITS)
+        and parameter.unit not in VISCOUS_UNITS
     )
     range_factor = MAX_RANGE_FACTOR_DRY_FRICTION if is_dry_friction else MAX_RANGE_FACTOR
     # The limits of a robot coefficient refer to the total with the value of the model file.

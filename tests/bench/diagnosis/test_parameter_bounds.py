@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bench.core.plugin_registries import load_plugins
+from bench.diagnosis.evaluation import parameter_bounds
 from bench.diagnosis.evaluation.parameter_bounds import bound_of, compute_coefficient_bounds
 from bench.diagnosis.evaluation.plausible_ranges import adapt_to_time_scale
 from bench.diagnosis.explain import explain
@@ -111,6 +112,15 @@ def test_a_fit_may_move_a_delay_up_to_the_longest_run(seconds):
         assert low in (0.0, pytest.approx(-min(max(longest / 4.0, 1.0), longest)))
 
 
+def test_only_the_dry_part_of_warming_friction_is_limited_to_what_slides(example_arm):
+    """A viscous part of five times its plausible range was left to a second cause."""
+    name = "friction.warming@elbow"
+    dry, viscous, _ = example_arm.parameters[example_arm.coefficient_slices[name]]
+    dry_bounds, viscous_bounds, _ = compute_coefficient_bounds(example_arm, name)
+    assert dry_bounds == pytest.approx((0.0, 4.0 * dry.bounds[1]))
+    assert viscous_bounds == pytest.approx((0.0, 20.0 * viscous.bounds[1]))
+
+
 @pytest.mark.parametrize(
     ("value", "low", "expected"),
     [
@@ -156,7 +166,9 @@ def bounded(tmp_path_factory):
     effect = ["--effect", "drag.linear=0.004"]
     run_command("simulate", "pendulum", "--out", path, *words, *effect)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bench.diagnosis.evaluation.parameter_bounds.MAX_RANGE_FACTOR", 0.02)
+        patch.setattr(parameter_bounds, "MAX_RANGE_FACTOR", 0.02)
+        # The viscous part of friction has the range of dry friction.
+        patch.setattr(parameter_bounds, "VISCOUS_UNITS", ())
         found = explain(path)
         printed = format_summary(found.story)
         found.write(folder / "out")
