@@ -55,10 +55,10 @@ _MIN_DIVISOR = 1e-9
 """Smallest speed, period or time, which replaces zero to avoid 0 / 0."""
 _FORCE_UNITS = ("m/s^2", "N", "N*m")
 """Units of a force on the three kinds of system."""
-_VISCOUS_UNITS = (None, "N*s/m", "N*m*s/rad")
+VISCOUS_UNITS = (None, "N*s/m", "N*m*s/rad")
 """Units of viscous friction on the kinds of system that can move in two directions."""
 _VISCOUS_RANGES = ((0, 0), (0, 5), (0, 0.05))
-"""Plausible viscous friction, in the units of `_VISCOUS_UNITS`."""
+"""Plausible viscous friction, in the units of `VISCOUS_UNITS`."""
 _LOAD_COEFFICIENT = Coefficient("coefficient", (None, "1", "1"), ((0, 0), (0, 0.5), (0, 0.5)))
 """Coefficient of load-dependent friction, as a fraction of the load."""
 _DRY_RANGES = ((0, 5), (0, 5), (0, 0.5))
@@ -77,7 +77,7 @@ _SQUARED_FORCE = ((None, "1/N", "1/(N*m)"), ((0, 0), (0, 0.1), (0, 1)))
 """Units and plausible values of the coefficient of a squared force."""
 _WARMING_COEFFICIENTS = (
     Coefficient("dry", _FORCE_UNITS, _DRY_RANGES),
-    Coefficient("viscous", _VISCOUS_UNITS, _VISCOUS_RANGES),
+    Coefficient("viscous", VISCOUS_UNITS, _VISCOUS_RANGES),
     Coefficient("time", ("s", "s", "s"), ((0.5, 500), (0.5, 500), (0.5, 500))),
 )
 """Coefficients of friction that decreases by warming."""
@@ -261,7 +261,7 @@ class DirectionalViscousFriction(Force):
     source = "A. Janot, M. Gautier, M. Brunot, Nonlinear System Identification Benchmarks (2019)"
     needs, contains = "guide", ("drag.linear",)
     coefficients = tuple(
-        Coefficient(f"viscous{way}", _VISCOUS_UNITS, _VISCOUS_RANGES) for way in "+-"
+        Coefficient(f"viscous{way}", VISCOUS_UNITS, _VISCOUS_RANGES) for way in "+-"
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:

@@ -305,7 +305,8 @@ class RecordingTable:
             if len(row) != width:
                 raise InputError(
                     f"{self.path}, row {self._find_line_number(record)}: "
-                    f"expected {width} cells as in the header, found {len(row)}"
+                    f"expected {width} cells as in the header, found {len(row)}; "
+                    "correct or delete the row"
                 )
 
     def _convert_to_numbers(self, name: str, cells: Sequence[str], first_row: int) -> Array:

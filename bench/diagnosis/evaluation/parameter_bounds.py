@@ -15,6 +15,7 @@ from bench.diagnosis.evaluation.plausible_ranges import is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from sims.core.effect import Coefficient, Effect, Friction
 from sims.core.simulator import Array, Parameter
+from sims.effects.friction import VISCOUS_UNITS
 
 MAX_RANGE_FACTOR = 20.0
 """Ratio of the fit bounds to the plausible range, for coefficients of equation-based systems."""
@@ -32,8 +33,6 @@ Stronger friction only sticks, and sticking divides the steps of the engine.
 """
 INVERSE_FORCE_UNITS = ("1/N", "1/(N")
 """Units of coefficients of terms that grow faster than linearly with a force."""
-VISCOUS_UNITS = ("N*s/m", "N*m*s/rad")
-"""Units of coefficients of terms that grow with the speed."""
 MIN_CYCLES_PER_RUN = 1.0
 """Minimum number of cycles of a periodic effect within the longest run.
 

@@ -67,13 +67,13 @@ class SparseSignals:
     @classmethod
     def join(cls, parts: Sequence[SparseSignals]) -> SparseSignals:
         """Return the columns of all parts, one part after another."""
-        first_columns = np.cumsum([0, *(part.shape[1] for part in parts)])
-        columns = [part.columns + first for part, first in zip(parts, first_columns, strict=False)]
+        *first_columns, count = np.cumsum([0, *(part.shape[1] for part in parts)]).tolist()
+        columns = [part.columns + first for part, first in zip(parts, first_columns, strict=True)]
         return cls(
             np.concatenate([part.values for part in parts], axis=2),
             np.concatenate([part.rows for part in parts]),
             np.concatenate(columns),
-            (parts[0].shape[0], int(first_columns[-1])),
+            (parts[0].shape[0], count),
         )
 
     def expand(self, begin: int, end: int) -> SingleArray:
@@ -110,29 +110,29 @@ class Columns:
         column_indices: (K,) index of the column of each candidate, which those with the same effect
             share.
         sizes: (K,) scaling coefficient of each probe.
-        pushed: mean forces and controls (R, T - 1, E + nu) of M columns between samples.
+        inputs: mean forces and controls (R, T - 1, E + nu) of M columns between samples.
         readings: ψ (R, T, C) of M columns.
     """
 
     probes: tuple[CandidateDirection, ...]
     column_indices: IndexArray
     sizes: Array
-    pushed: SparseSignals
+    inputs: SparseSignals
     readings: SparseSignals
 
     def joined(self, others: Columns) -> Columns:
         """Return the columns of these candidates, followed by those of others."""
         return Columns(
             self.probes + others.probes,
-            np.concatenate([self.column_indices, others.column_indices + self.pushed.shape[1]]),
+            np.concatenate([self.column_indices, others.column_indices + self.inputs.shape[1]]),
             np.concatenate([self.sizes, others.sizes]),
-            SparseSignals.join([self.pushed, others.pushed]),
+            SparseSignals.join([self.inputs, others.inputs]),
             SparseSignals.join([self.readings, others.readings]),
         )
 
     def iterate_batches(self) -> Iterator[ColumnBatch]:
         """Iterate over the columns of the candidates, in batches that fit in the CPU cache."""
-        count = self.pushed.shape[1]
+        count = self.inputs.shape[1]
         for begin in range(0, count, COLUMNS_PER_BATCH):
             end = min(begin + COLUMNS_PER_BATCH, count)
             candidates = np.flatnonzero(
@@ -142,7 +142,7 @@ class Columns:
                 yield ColumnBatch(
                     candidates,
                     self.column_indices[candidates] - begin,
-                    self.pushed.expand(begin, end),
+                    self.inputs.expand(begin, end),
                     self.readings.expand(begin, end),
                 )
 
@@ -173,7 +173,7 @@ class Columns:
         """
         columns = self.column_indices[list(chosen)]
         weights = coefficients / self.sizes[list(chosen)]
-        return self.pushed.total(columns, weights), self.readings.total(columns, weights)
+        return self.inputs.total(columns, weights), self.readings.total(columns, weights)
 
 
 class ColumnBatch(NamedTuple):
@@ -182,13 +182,13 @@ class ColumnBatch(NamedTuple):
     Attributes:
         candidates: indices of the candidates that have one of these columns.
         columns: index, among these columns, of the column of each of the candidates.
-        pushed: (R, T - 1, E + nu, m) mean forces and controls of m columns.
+        inputs: (R, T - 1, E + nu, m) mean forces and controls of m columns.
         readings: ψ (R, T, C, m).
     """
 
     candidates: IndexArray
     columns: IndexArray
-    pushed: SingleArray
+    inputs: SingleArray
     readings: SingleArray
 
 
@@ -229,11 +229,11 @@ def compute_columns(followed: FollowedRuns, probes: Sequence[CandidateDirection]
         # An empty batch if there are no effects.
         for begin in range(0, max(len(effects), 1), COLUMNS_PER_BATCH)
     ]
-    pushed, readings = (SparseSignals.join(parts) for parts in zip(*batches, strict=True))
+    inputs, readings = (SparseSignals.join(parts) for parts in zip(*batches, strict=True))
     sizes = np.array(
         [1.0 if p.is_single_size else p.coefficients[p.coefficient_index] for p in probes]
     )
-    return Columns(tuple(probes), np.array(column_indices, dtype=np.intp), sizes, pushed, readings)
+    return Columns(tuple(probes), np.array(column_indices, dtype=np.intp), sizes, inputs, readings)
 
 
 def _compute_inputs(
@@ -249,21 +249,21 @@ def _compute_inputs(
         Mean forces and controls between samples, and direct changes of the readings.
     """
     run_count, samples, channels = followed.runs.residuals.shape
-    inputs = followed.runs.inputs.shape[3]
-    pushed = np.zeros((run_count, samples - 1, inputs, len(effects)), dtype=np.float32)
+    input_count = followed.runs.inputs.shape[3]
+    inputs = np.zeros((run_count, samples - 1, input_count, len(effects)), dtype=np.float32)
     readings = np.zeros((run_count, samples, channels, len(effects)), dtype=np.float32)
     changes = compute_control_changes(followed.linear, effects)
     for run, (linear, driven) in enumerate(zip(followed.linear, changes, strict=True)):
         predicted = followed.filtered.predicted[
             run, : linear.knots.size, : followed.runs.prior.size
         ]
-        run_pushed, run_readings = linear.added(effects, np.nan_to_num(predicted), driven)
-        pushed[run, : run_pushed.shape[0]] = run_pushed
+        run_inputs, run_readings = linear.added(effects, np.nan_to_num(predicted), driven)
+        inputs[run, : run_inputs.shape[0]] = run_inputs
         readings[run, : run_readings.shape[0]] = run_readings
     readings[~followed.runs.recorded] = 0.0
-    is_finite = np.isfinite(pushed).all(axis=(0, 1, 2)) & np.isfinite(readings).all(axis=(0, 1, 2))
-    pushed[..., ~is_finite], readings[..., ~is_finite] = 0.0, 0.0
-    return SparseSignals.from_dense(pushed), SparseSignals.from_dense(readings)
+    is_finite = np.isfinite(inputs).all(axis=(0, 1, 2)) & np.isfinite(readings).all(axis=(0, 1, 2))
+    inputs[..., ~is_finite], readings[..., ~is_finite] = 0.0, 0.0
+    return SparseSignals.from_dense(inputs), SparseSignals.from_dense(readings)
 
 
 def compute_responses(followed: FollowedRuns, columns: Columns, responses: SingleArray) -> None:
@@ -279,24 +279,22 @@ def compute_responses(followed: FollowedRuns, columns: Columns, responses: Singl
             units of the candidates' coefficients; it is overwritten.
     """
     recursion = _FilterRecursion.of(followed)
-    inputs = followed.runs.inputs.astype(np.float32)
+    input_matrices = followed.runs.inputs.astype(np.float32)
     for batch in columns.iterate_batches():
-        whitened = recursion.propagate(batch.pushed, batch.readings, inputs)
-        sizes = columns.sizes[batch.candidates].astype(np.float32)
         # Slices of consecutive candidates are written several times faster than single ones.
         breaks = np.flatnonzero(np.diff(batch.candidates) != 1) + 1
         parts = np.split(np.arange(batch.candidates.size), breaks)
-        # One run at a time, because the arrays of all runs together exceed the CPU cache.
-        for run, values in enumerate(whitened):
-            scaled = np.take(values, batch.columns, axis=2, mode="clip")
-            with np.errstate(all="ignore"):
-                scaled /= sizes
+        with np.errstate(all="ignore"):
+            whitened = recursion.propagate(input_matrices @ batch.inputs, batch.readings)
+            # One run at a time, because the arrays of all runs together exceed the CPU cache.
+            for run, values in enumerate(whitened):
+                scaled = np.take(values, batch.columns, axis=2, mode="clip")
+                scaled /= columns.sizes[batch.candidates].astype(np.float32)
                 # A candidate with a divergent motion gets a response of zero.
                 scaled[~(np.abs(scaled) < MAX_MAGNITUDE)] = 0.0
-            for part in parts:
-                candidates = batch.candidates[part]
-                slots = slice(candidates[0], candidates[-1] + 1)
-                responses[run, ..., slots] = scaled[..., part[0] : part[-1] + 1]
+                for part in parts:
+                    first, last = batch.candidates[part[[0, -1]]]
+                    responses[run, ..., first : last + 1] = scaled[..., part[0] : part[-1] + 1]
 
 
 def compute_parameter_responses(
@@ -319,7 +317,7 @@ def compute_parameter_responses(
         samples of C channels.
     """
     run_count, samples, channels = followed.runs.residuals.shape
-    pushed = np.zeros(
+    changes = np.zeros(
         (run_count, samples - 1, followed.runs.prior.size, len(indices)), dtype=np.float32
     )
     readings = np.zeros((run_count, samples, channels, len(indices)), dtype=np.float32)
@@ -334,13 +332,13 @@ def compute_parameter_responses(
             )
             defects, predicted = displaced.compute_changes(linear)
             with np.errstate(all="ignore"):
-                pushed[run, : len(defects), :, column] = -defects / size
+                changes[run, : len(defects), :, column] = -defects / size
                 readings[run, : len(predicted), :, column] = predicted / size
     readings[~followed.runs.recorded] = 0.0
     # A step in which the model diverges gives no information on the next one.
-    for values in (pushed, readings):
+    for values in (changes, readings):
         values[~(np.abs(values) < MAX_MAGNITUDE)] = 0.0
-    return _FilterRecursion.of(followed).propagate(pushed, readings)
+    return _FilterRecursion.of(followed).propagate(changes, readings)
 
 
 def compute_step_error_response(followed: FollowedRuns) -> Array:
@@ -370,8 +368,8 @@ def compute_sensitivities(
     result = np.zeros((run_count, samples, channels, len(columns.probes)), dtype)
     for batch in columns.iterate_batches():
         changes = followed.propagate_without_gain(
-            np.zeros((run_count, followed.runs.prior.size, batch.pushed.shape[3])),
-            batch.pushed,
+            np.zeros((run_count, followed.runs.prior.size, batch.inputs.shape[3])),
+            batch.inputs,
             batch.readings,
         )
         with np.errstate(all="ignore"):
@@ -407,9 +405,7 @@ class _FilterRecursion(NamedTuple):
             followed.runs.prior.size,
         )
 
-    def propagate(
-        self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None
-    ) -> SingleArray:
+    def propagate(self, changes: SingleArray, readings: SingleArray) -> SingleArray:
         """Propagate columns through the filter, and return the whitened responses (R, T, C, m).
 
         The recursion is s[i+1] = A (s[i] - K u[i]) + b[i] with u = H s + ψ, where s is the change
@@ -418,9 +414,8 @@ class _FilterRecursion(NamedTuple):
         docstring, for all m columns in single precision.
 
         Args:
-            pushed: (R, T - 1, E + nu, m) forces and controls, or states if `inputs` is None.
+            changes: b (R, T - 1, Z, m) of the states of the robot.
             readings: ψ (R, T, C, m).
-            inputs: (R, T - 1, Z, E + nu) matrices that map `pushed` to b.
         """
         samples = readings.shape[1]
         responses = np.zeros_like(readings)
@@ -433,8 +428,7 @@ class _FilterRecursion(NamedTuple):
                 if i + 1 < samples:
                     s -= self.gains[:, i] @ u
                     s = self.states[:, i] @ s
-                    added = pushed[:, i]
                     # Candidates act on the states of the robot, not on those of coloured noise.
-                    s[:, : self.size] += added if inputs is None else inputs[:, i] @ added
+                    s[:, : self.size] += changes[:, i]
         responses[~np.isfinite(responses)] = 0.0
         return responses

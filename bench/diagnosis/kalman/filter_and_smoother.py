@@ -168,7 +168,7 @@ class Filtered:
 
     Attributes:
         predicted: δ- (B, T, Z).
-        covariances: P- (B, T, Z, Z).
+        covariances: P- (B, T, Z, Z); empty (B, 0, 0, 0) after `without_covariances`.
         innovations: e (B, T, C), zero where nothing was recorded.
         gains: K (B, T, Z, C).
         whiteners: W (B, T, C, C) with Wᵀ W = S⁻¹.
@@ -185,6 +185,13 @@ class Filtered:
     def subset(self, chosen: IndexArray) -> Filtered:
         """Return some of the runs."""
         return Filtered(*(getattr(self, one.name)[chosen] for one in fields(self)))
+
+    def without_covariances(self) -> Filtered:
+        """Return the results without the covariances.
+
+        They are a third of the memory, and only the smoother needs them.
+        """
+        return replace(self, covariances=np.zeros((len(self.covariances), 0, 0, 0)))
 
     @property
     def whitened(self) -> Array:
@@ -355,9 +362,7 @@ def fit_process_noise(
     if is_long:
         filtered = filter_runs(runs, force, white)
         smoothed = smooth_runs(runs, filtered, force)
-    # A third of the memory of a filter, which only the smoother needs.
-    no_covariances = np.zeros((len(filtered.covariances), 0, 0, 0))
-    return force, replace(filtered, covariances=no_covariances), smoothed
+    return force, filtered.without_covariances(), smoothed
 
 
 def _make_contiguous(*arrays: Array) -> tuple[Array, ...]:

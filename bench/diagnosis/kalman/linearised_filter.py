@@ -426,7 +426,7 @@ class FollowedRuns:
         return float(np.abs(changes).max(initial=0.0))
 
     def propagate_without_gain(
-        self, s: Array, pushed: SingleArray | None = None, readings: SingleArray | None = None
+        self, s: Array, inputs: SingleArray | None = None, readings: SingleArray | None = None
     ) -> Array:
         """Propagate K changes of the first states, and optional inputs, through the linear model.
 
@@ -436,9 +436,9 @@ class FollowedRuns:
 
         Args:
             s: (R, Z, K) changes of the Z components of the first states of R runs.
-            pushed: f (R, T - 1, E + nu, K) changes of E forces and nu controls between T samples;
+            inputs: f (R, T - 1, E + nu, K) changes of E forces and nu controls between T samples;
                 None if there are none.
-            readings: ψ (R, T, C, K) direct changes of the readings of C channels, if `pushed` is
+            readings: ψ (R, T, C, K) direct changes of the readings of C channels, if `inputs` is
                 given.
 
         Returns:
@@ -454,8 +454,8 @@ class FollowedRuns:
                     responses[:, i] += readings[:, i]
                 if i + 1 < samples:
                     s = runs.states[:, i] @ s
-                    if pushed is not None:
-                        s += runs.inputs[:, i] @ pushed[:, i]
+                    if inputs is not None:
+                        s += runs.inputs[:, i] @ inputs[:, i]
         responses[~(np.abs(responses) < MAX_MAGNITUDE)] = 0.0
         return responses
 

@@ -35,8 +35,8 @@ MIN_TESTED_EXCESS = 0.5
 although the innovations do not show them.
 """
 MIN_ERROR_SHARE = 0.3
-"""Minimum simulated error of the step, as a share of the residual, for which finer ones are tried
-although the innovations do not show it.
+"""Minimum simulated error of the step for which finer steps are tried although the innovations do
+not show it, as a share of the residual.
 """
 MAX_SUBSET_EFFECTS = 3
 """Maximum number of effects of which all subsets are fitted with another time step."""
@@ -85,9 +85,8 @@ class TimeStepChoice:
         # Copies of a tee share the refinements that were simulated, for `reconsider`.
         (refinements,) = tee(find_step_refinements(runs.fitting, runs.noise), 1)
         first = next(copy(refinements), None)
-        if first is None:
-            return model
-        if not shows_errors and not first.error > MIN_ERROR_SHARE * residual_rms:
+        min_error = 0.0 if shows_errors else MIN_ERROR_SHARE * residual_rms
+        if first is None or not first.error > min_error:
             return model
         self._refinements = refinements
         # The error of a step must be far below `residual_rms`, the residual that remains with the

@@ -124,29 +124,38 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     return select_likeliest(fit_competing_models(context, single), best)
 
 
-def fit_competing_models(
-    context: SearchContext,
-    best: FittedModel,
-    compared: frozenset[frozenset[str]] = frozenset(),
-) -> FittedModel:
+def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedModel:
     """Fit the sets that are nearly as good by the regression, and return the best of all.
 
     Each effect of the best model is replaced in turn by the effects that a regression finds nearly
     as good; where the regression is not certain, a filter or simulations confirm it. The effects
     are also moved to other joints of their kinematic loop, and payloads to neighbouring bodies.
-    Models that remain close to the best are fitted to convergence.
+    Models that remain close to the best are fitted to convergence. This is repeated about a better
+    model, about which effects that act alike have better starts. It ends at a set that was compared
+    before: a family may be likelier than its only member that acts, which is preferred to it.
 
     Args:
         context: search, filters and regressions of the recording.
         best: the best model so far.
-        compared: sets of effects whose competitors were fitted before. A family may be likelier
-            than its only member that acts, which is preferred; the comparison ends there.
 
     Returns:
         The fitted model with the highest penalised log-likelihood among those with as many effects
         as `best`; `best` itself if it has no effects or series joints.
     """
-    compared |= {frozenset(best.effects)}
+    compared = set[frozenset[str]]()
+    while frozenset(best.effects) not in compared:
+        compared.add(frozenset(best.effects))
+        best = _find_better_competitor(context, best)
+    return best
+
+
+def _find_better_competitor(context: SearchContext, best: FittedModel) -> FittedModel:
+    """Fit the competing models about the best one, and return the best of all.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model so far.
+    """
     search, evaluator = context.search, context.evaluator
     has_no_fit = not best.effects or not np.isfinite(best.fit.cost)
     if has_no_fit or has_series(evaluator, best.effects):
@@ -173,15 +182,11 @@ def fit_competing_models(
     preferred = search.get_best(size) or best
     merged = _replace_two_effects(context, preferred)
     if merged is not None:
-        return fit_competing_models(context, merged, compared)
+        return merged
     if set(preferred.effects) == set(best.effects):
         return preferred
-    # A family may replace another one, and a single member of it may be enough. About a better
-    # model, effects that act alike have better starts.
-    simplified = remove_idle_effects(context, preferred)
-    if frozenset(simplified.effects) in compared:
-        return simplified
-    return fit_competing_models(context, simplified, compared)
+    # A family may replace another one, and a single member of it may be enough.
+    return remove_idle_effects(context, preferred)
 
 
 def _should_fit(

@@ -93,10 +93,12 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     remove_idle_effects,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
+    MAX_SINGLE_SQUARES_SHARE,
     fit_likely_effects,
     fit_series_effects,
     fit_single_effects,
     list_likely_starts,
+    simulate_series_effects,
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
@@ -258,8 +260,10 @@ class PredictionErrorSearch(EffectSearch):
             selected_with_shapes = context.columns.select_with_shapes(selected)
             best = select_likeliest(best, fit_quick_selection(context, selected_with_shapes))
             check_simple_friction(context, best)
+        series: list[RatedStart] | None = None
         if self._should_continue(best):
-            likely_series = fit_series_effects(context, selected_with_shapes, is_only_likely=True)
+            series = simulate_series_effects(context, selected_with_shapes)
+            likely_series = fit_series_effects(context, series, MAX_SINGLE_SQUARES_SHARE)
             best = select_likeliest(best, likely_series)
         if self._should_continue(best):
             best = self._add_missing_effects(best, selected, friction)
@@ -268,7 +272,9 @@ class PredictionErrorSearch(EffectSearch):
             # These effects are fitted from other first states, which must not be their only gain.
             best = select_likeliest(best, self.refit_first_states(self.base_model))
         if not is_explained(context, best) and not self.evaluator.search_control.is_over():
-            best = select_likeliest(best, fit_series_effects(context, selected_with_shapes))
+            if series is None:
+                series = simulate_series_effects(context, selected_with_shapes)
+            best = select_likeliest(best, fit_series_effects(context, series))
         # The quick fits may have skipped the selection because it is slow to simulate.
         if not best.effects:
             best = fit_selection(context, selected_with_shapes)

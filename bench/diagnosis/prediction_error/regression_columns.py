@@ -68,7 +68,7 @@ class LibraryColumns:
     _library: Columns | None = None
     _base_regression: tuple[Columns, Regression] | None = None
     _hats: Columns | None = None
-    _newest: tuple[FittedModel, ModelRegression] | None = None
+    _newest_regression: tuple[FittedModel, ModelRegression] | None = None
 
     @property
     def library(self) -> Columns:
@@ -188,18 +188,20 @@ class LibraryColumns:
         Args:
             model: the fitted model.
         """
-        if self._newest is not None and _has_similar_parameters(model, self._newest[0]):
-            return self._newest[1]
-        # A regression is large, so that the last one goes before the next one is made.
-        self._newest = None
+        if self._newest_regression is not None:
+            known, regression = self._newest_regression
+            if _has_similar_parameters(model, known):
+                return regression
+        # A regression is large, so the last one is released before the next one is made.
+        self._newest_regression = None
         current = FilteredSet(self.filters.get_filter(model), model.effects)
         regression = build_regression_about(current, [self.library, self.hats], self.filters.base)
-        self._newest = model, regression
+        self._newest_regression = model, regression
         return regression
 
     def release_regressions(self) -> None:
-        """Release the memory of the regressions, which are made again if they are needed."""
-        self._newest = self._base_regression = None
+        """Release the memory of the regressions; `known_base_regression` is None afterwards."""
+        self._newest_regression = self._base_regression = None
 
     def sensitivities(self, start: FitStart) -> KnownJacobian:
         """Return the derivatives of the runs by the coefficients of a model's effects.
@@ -233,9 +235,8 @@ class LibraryColumns:
 def _has_similar_parameters(model: FittedModel, other: FittedModel) -> bool:
     """Return whether two models have the same effects and nearly the same parameters."""
     theta, other_theta = model.fit.theta, other.fit.theta
-    tolerance = RELATIVE_DIFFERENCE * np.abs(other_theta)
-    is_similar = bool((np.abs(theta - other_theta) <= tolerance).all())
-    return model.effects == other.effects and is_similar
+    is_similar = np.abs(theta - other_theta) <= RELATIVE_DIFFERENCE * np.abs(other_theta)
+    return model.effects == other.effects and bool(is_similar.all())
 
 
 def list_probes(

@@ -705,7 +705,7 @@ def follow_linear_with_effects(
     runs = followed.runs
     defects, residuals = runs.defects - numerics * followed.step_errors, runs.residuals
     if own_columns:
-        pushed, readings = columns.total(own_columns, np.concatenate(list(coefficients)))
-        defects = defects - np.einsum("rtze,rte->rtz", runs.inputs, pushed)
+        inputs, readings = columns.total(own_columns, np.concatenate(list(coefficients)))
+        defects = defects - np.einsum("rtze,rte->rtz", runs.inputs, inputs)
         residuals = np.where(runs.recorded, residuals - readings, 0.0)
     return followed.refit_noise(replace(runs, defects=defects, residuals=residuals))

@@ -257,47 +257,60 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
     return best
 
 
-def fit_series_effects(
-    context: SearchContext, selected: Selected, is_only_likely: bool = False
-) -> FittedModel:
-    """Fit elastic joints and backlash between drive and links at the most affected joints.
+def simulate_series_effects(context: SearchContext, selected: Selected) -> list[RatedStart]:
+    """Simulate elastic joints and backlash between drive and links at the most affected joints.
 
-    These effects have their own states, so a regression cannot score them. Each of their trial
-    coefficients is simulated; the best of each effect is fitted; the likeliest is fitted to
-    convergence. The joints are the most affected ones without any effect and with the selected
-    ones, which may be wrong. Effects that were fitted before are left out.
+    These effects have their own states, so a regression cannot score them, and each of their trial
+    coefficients is simulated. The joints are the most affected ones without any effect and with the
+    selected ones, which may be wrong.
 
     Args:
         context: search, filters and regressions of the recording.
         selected: the selection, whose missing forces determine one of the joints.
-        is_only_likely: whether to fit only effects that remove most of the residual without being
-            fitted.
 
     Returns:
-        The fitted model, whether or not it is good; the base model if there are no such effects.
+        The best start of each effect.
     """
-    evaluator, search = context.evaluator, context.search
+    evaluator = context.evaluator
     joints = {followed.joints_by_loss[0] for followed in (context.filters.base, selected.followed)}
     names = [
         name
         for name in evaluator.library
         if is_series_effect(evaluator.available_effects[name])
         and acts_at_joint(evaluator, name, joints)
-        and frozenset([name]) not in search.models
     ]
     starts = [start for name in names for start in _list_series_starts(context, name)]
     if not starts:
-        return search.base_model
+        return []
     evaluator.search_control.begin_stage(
         "testing elasticity and backlash between drives and links", len(starts)
     )
-    share = MAX_SINGLE_SQUARES_SHARE if is_only_likely else np.inf
-    limit = share * search.base_model.fit.cost
-    lowest = [start for cost, start in select_lowest_of_each(context, starts) if cost < limit]
-    if not lowest:
+    return select_lowest_of_each(context, starts)
+
+
+def fit_series_effects(
+    context: SearchContext, simulated: Sequence[RatedStart], max_share: float = np.inf
+) -> FittedModel:
+    """Fit elastic joints and backlash that were not fitted before, the likeliest to convergence.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        simulated: start of each effect (`simulate_series_effects`).
+        max_share: maximum share of the squared residual of the base model that a start leaves.
+
+    Returns:
+        The fitted model, whether or not it is good; the base model if there are no such effects.
+    """
+    search = context.search
+    limit = max_share * search.base_model.fit.cost
+    starts = [
+        start
+        for cost, start in simulated
+        if cost < limit and frozenset(start.effects) not in search.models
+    ]
+    if not starts:
         return search.base_model
-    fitted = search.fit_all(lowest)
-    return fit_by_simulation(context, select_likeliest(*fitted).fit.make_start())
+    return fit_by_simulation(context, select_likeliest(*search.fit_all(starts)).fit.make_start())
 
 
 def _list_series_starts(context: SearchContext, name: str) -> list[FitStart]:

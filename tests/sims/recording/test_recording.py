@@ -121,7 +121,10 @@ def test_faulty_table_is_one_line_that_says_where(tmp_path, old, new, message):
     [
         ("run,t,x,u\n", "expected rows of data, found none"),
         ("", "row 1: expected columns run, t, u, x between commas, found ''"),
-        (CSV + "b,1,2,3,4,5\n", "row 7: expected 4 cells as in the header, found 6"),
+        (
+            CSV + "b,1,2,3,4,5\n",
+            "row 7: expected 4 cells as in the header, found 6; correct",
+        ),
         (CSV + "b,1,2\n", "row 7: expected 4 cells as in the header, found 3"),
         (
             CSV.replace("x,u", "x,u,v").replace("\n1,", "\n1,0,"),

@@ -85,9 +85,9 @@ def test_responses_of_several_batches_are_those_of_single_columns(followed):
     # The last candidate has the column of the fifth one, and all others are in disorder.
     order = np.append(np.random.default_rng(4).permutation(count), 4)
     sizes = np.linspace(0.5, 2.0, order.size)
-    pushed = SparseSignals.from_dense(forces)
+    inputs = SparseSignals.from_dense(forces)
     probes = (None,) * order.size
-    columns = Columns(probes, order, sizes, pushed, SparseSignals.from_dense(readings))
+    columns = Columns(probes, order, sizes, inputs, SparseSignals.from_dense(readings))
     responses = np.full((runs, samples, channels, order.size), np.nan, dtype=np.float32)
     compute_responses(followed, columns, responses)
     for candidate in (0, 100, order.size - 1):

@@ -1,95 +1,99 @@
-"""Which elastic and slack transmissions are tried, and when they are fitted."""
+"""Which elastic and slack transmissions are simulated, and when they are fitted."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error import single_effect_fits
 from bench.diagnosis.prediction_error.regression_columns import list_probes
+from bench.diagnosis.prediction_error.simulated_fits import RatedStart
 from bench.diagnosis.prediction_error.single_effect_fits import (
+    MAX_SINGLE_SQUARES_SHARE,
     SMALLER_SERIES_SHARES,
     fit_series_effects,
+    simulate_series_effects,
 )
 
 BASE_COST = 1000.0
 
 
-def try_series_effects(evaluator, monkeypatch, costs, models=(), is_only_likely=False):
-    """Return the simulated starts by effect, and the names of the fitted effects.
+@pytest.fixture
+def simulated(example_arm, monkeypatch):
+    """Return the coefficients of all simulated starts by effect.
 
     The wrong selection has moved the largest missing force from the first to the second joint.
     """
-    tried, fitted = {}, []
+    monkeypatch.setattr(single_effect_fits, "select_lowest_of_each", lambda _, starts: starts)
 
     def make_theta_with(name, coefficients):
-        theta = evaluator.get_nominal_theta()
-        theta[evaluator.coefficient_slices[name]] = coefficients
+        theta = example_arm.get_nominal_theta()
+        theta[example_arm.coefficient_slices[name]] = coefficients
         return theta
 
-    def select_lowest_of_each(_context, starts):
-        for start in starts:
-            (name,) = start.effects
-            tried.setdefault(name, []).append(start.theta[evaluator.coefficient_slices[name]])
-        return [
-            (costs.get(name, 2.0 * BASE_COST), SimpleNamespace(effects=(name,))) for name in tried
-        ]
-
-    def fit_all(starts):
-        fitted.extend(name for start in starts for name in start.effects)
-        return [SimpleNamespace(fit=SimpleNamespace(make_start=lambda: None))]
-
-    monkeypatch.setattr(single_effect_fits, "select_lowest_of_each", select_lowest_of_each)
-    monkeypatch.setattr(single_effect_fits, "select_likeliest", lambda *models: models[0])
-    monkeypatch.setattr(single_effect_fits, "fit_by_simulation", lambda *_: None)
     context = SimpleNamespace(
-        evaluator=evaluator,
-        search=SimpleNamespace(
-            base_model=SimpleNamespace(fit=SimpleNamespace(cost=BASE_COST)),
-            models={frozenset([name]): None for name in models},
-            fit_all=fit_all,
-        ),
+        evaluator=example_arm,
         filters=SimpleNamespace(
             base=SimpleNamespace(joints_by_loss=[0, 1]), make_theta_with=make_theta_with
         ),
-        columns=SimpleNamespace(probes=lambda names: list_probes(evaluator, (), names)),
+        columns=SimpleNamespace(probes=lambda names: list_probes(example_arm, (), names)),
     )
     selected = SimpleNamespace(followed=SimpleNamespace(joints_by_loss=[1, 0]))
-    fit_series_effects(context, selected, is_only_likely)
-    return tried, fitted
+    coefficients = {}
+    for start in simulate_series_effects(context, selected):
+        (name,) = start.effects
+        slots = example_arm.coefficient_slices[name]
+        coefficients.setdefault(name, []).append(start.theta[slots])
+    return coefficients
 
 
-def test_joints_are_those_without_and_with_the_selected_effects(example_arm, monkeypatch):
-    tried, fitted = try_series_effects(example_arm, monkeypatch, {})
-    names = {
+def test_joints_are_those_without_and_with_the_selected_effects(simulated):
+    assert set(simulated) == {
         f"joint.{law}@{joint}"
         for law in ("flexibility", "backlash")
         for joint in ("shoulder", "elbow")
     }
-    assert set(tried) == set(fitted) == names
 
 
-def test_smaller_gaps_than_those_of_the_probes_are_tried(example_arm, monkeypatch):
-    tried, _ = try_series_effects(example_arm, monkeypatch, {})
-    (name,) = (name for name in tried if name == "joint.backlash@elbow")
+def test_smaller_gaps_than_those_of_the_probes_are_simulated(example_arm, simulated):
+    name = "joint.backlash@elbow"
     probed = [probe.coefficients[0] for probe in list_probes(example_arm, (), [name])]
-    gaps = sorted(float(coefficients[0]) for coefficients in tried[name])
+    gaps = sorted(float(coefficients[0]) for coefficients in simulated[name])
     assert gaps[:2] == pytest.approx([share * min(probed) for share in SMALLER_SERIES_SHARES])
     np.testing.assert_allclose(gaps[2:], sorted(probed))
 
 
 @pytest.mark.parametrize(
-    ("is_only_likely", "expected"),
+    ("max_share", "expected"),
     [
-        (True, ["joint.backlash@elbow"]),
-        (False, ["joint.backlash@elbow", "joint.backlash@shoulder"]),
+        (MAX_SINGLE_SQUARES_SHARE, ["joint.backlash@elbow"]),
+        (np.inf, ["joint.backlash@elbow", "joint.backlash@shoulder"]),
     ],
 )
 def test_early_only_effects_that_remove_most_of_the_residual_are_fitted(
-    example_arm, monkeypatch, is_only_likely, expected
+    monkeypatch, max_share, expected
 ):
-    costs = {"joint.backlash@elbow": 0.2 * BASE_COST, "joint.backlash@shoulder": 0.4 * BASE_COST}
-    known = ("joint.flexibility@elbow", "joint.flexibility@shoulder")
-    tried, fitted = try_series_effects(example_arm, monkeypatch, costs, known, is_only_likely)
-    assert set(tried) == set(costs), "effects that were fitted before are left out"
-    assert sorted(fitted) == expected
+    """Effects that were fitted before are left out."""
+    costs = {
+        "joint.backlash@elbow": 0.2, "joint.backlash@shoulder": 0.4, "joint.flexibility@elbow": 0.1
+    }  # fmt: skip
+    starts = [
+        RatedStart(share * BASE_COST, FitStart((name,), np.zeros(1), np.zeros((1, 2))))
+        for name, share in costs.items()
+    ]
+    fitted = []
+
+    def fit_all(started):
+        fitted.extend(name for start in started for name in start.effects)
+        return [SimpleNamespace(fit=SimpleNamespace(make_start=lambda: None))]
+
+    monkeypatch.setattr(single_effect_fits, "select_likeliest", lambda *models: models[0])
+    monkeypatch.setattr(single_effect_fits, "fit_by_simulation", lambda *_: None)
+    search = SimpleNamespace(
+        base_model=SimpleNamespace(fit=SimpleNamespace(cost=BASE_COST)),
+        models={frozenset(["joint.flexibility@elbow"]): None},
+        fit_all=fit_all,
+    )
+    fit_series_effects(SimpleNamespace(search=search), starts, max_share)
+    assert fitted == expected
