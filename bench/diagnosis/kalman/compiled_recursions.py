@@ -25,23 +25,31 @@ def multiply_sparse(a: Array, b: Array, out: Array) -> None:
                     out[i, j] += factor * b[k, j]
 
 
-def propagate_covariance(a: Array, p: Array, half: Array, out: Array) -> None:
+def multiply_transposed(a: Array, b: Array, out: Array) -> None:
+    """Write aᵀ b to `out`; zeros of a are skipped."""
+    for i in range(a.shape[1]):
+        for j in range(b.shape[1]):
+            out[i, j] = 0.0
+    for k in range(a.shape[0]):
+        for i in range(a.shape[1]):
+            factor = a[k, i]
+            if factor != 0.0:
+                for j in range(b.shape[1]):
+                    out[i, j] += factor * b[k, j]
+
+
+def propagate_covariance(a: Array, p: Array, product: Array, out: Array) -> None:
     """Write a p aᵀ for a symmetric matrix p to `out`, as a covariance is propagated.
 
-    `half` receives the product a p. Only the upper triangle is computed; the lower one is copied.
-    Zeros of a are skipped, because most entries of a transition matrix are zero.
+    `product` receives (a p)ᵀ = p aᵀ, for which `out` is used as a buffer. The lower triangle is
+    copied from the upper one, so that the result is exactly symmetric.
     """
-    multiply_sparse(a, p, half)
+    multiply_sparse(a, p, out)
     size = a.shape[0]
     for i in range(size):
-        for j in range(i, size):
-            out[i, j] = 0.0
-    for j in range(size):
-        for k in range(a.shape[1]):
-            factor = a[j, k]
-            if factor != 0.0:
-                for i in range(j + 1):
-                    out[i, j] += half[i, k] * factor
+        for j in range(size):
+            product[j, i] = out[i, j]
+    multiply_sparse(a, product, out)
     for i in range(size):
         for j in range(i):
             out[i, j] = out[j, i]
@@ -115,8 +123,8 @@ def run_filter(
         spread: (Z, Z) propagated covariance.
         root: (C, C) Cholesky factor L of S.
         inverse: (C, C) inverse of L.
-        crossed: (Z, C) P Hᵀ.
-        half: (Z, C) P Hᵀ L⁻ᵀ.
+        crossed: (C, Z) H P.
+        half: (C, Z) L⁻¹ H P.
         w: (C,) whitened innovation.
     """
     runs, samples, channels, size = readings.shape
@@ -133,22 +141,19 @@ def run_filter(
                 predicted[run, i, z] = x[z]
                 for y in range(size):
                     covariances[run, i, z, y] = p[z, y]
-            # crossed = P Hᵀ; zeros of H are skipped.
-            for z in range(size):
-                for c in range(channels):
-                    crossed[z, c] = 0.0
+            # crossed = H P; zeros of H are skipped.
+            multiply_sparse(h, p, crossed)
+            # Cholesky factor L of S, its inverse W, and half = W H P
             for c in range(channels):
+                for d in range(c + 1):
+                    root[c, d] = variances[run, i, c] if c == d else 0.0
                 for y in range(size):
                     factor = h[c, y]
                     if factor != 0.0:
-                        for z in range(size):
-                            crossed[z, c] += p[z, y] * factor
-            # Cholesky factor L of S, its inverse W, and half = P Hᵀ Wᵀ
-            for c in range(channels):
+                        for d in range(c + 1):
+                            root[c, d] += factor * crossed[d, y]
                 for d in range(c + 1):
-                    value = variances[run, i, c] if c == d else 0.0
-                    for y in range(size):
-                        value += h[c, y] * crossed[y, d]
+                    value = root[c, d]
                     for k in range(d):
                         value -= root[c, k] * root[d, k]
                     root[c, d] = np.sqrt(value) if c == d else value / root[d, d]
@@ -158,12 +163,7 @@ def run_filter(
                     for k in range(d, c):
                         value -= root[c, k] * inverse[k, d]
                     inverse[c, d] = value / root[c, c]
-            for z in range(size):
-                for c in range(channels):
-                    value = 0.0
-                    for d in range(c + 1):
-                        value += crossed[z, d] * inverse[c, d]
-                    half[z, c] = value
+            multiply_sparse(inverse, crossed, half)
             # Innovation, whitened innovation w = W e, and what they add to the log-likelihood.
             for c in range(channels):
                 value = residuals[run, i, c]
@@ -177,25 +177,23 @@ def run_filter(
                     whiteners[run, i, c, d] = inverse[c, d]
                 w[c] = value
                 total -= np.log(root[c, c]) + 0.5 * value * value
-            # K = half W
+            # K = halfᵀ W
             for z in range(size):
                 for c in range(channels):
-                    value = 0.0
-                    for d in range(c, channels):
-                        value += half[z, d] * inverse[d, c]
-                    gains[run, i, z, c] = value
+                    factor = half[c, z]
+                    for d in range(c + 1):
+                        gains[run, i, z, d] += factor * inverse[c, d]
             if i + 1 == samples:
                 break
-            # Update by the reading: K e = half w, and K S Kᵀ = half halfᵀ
+            # Update by the reading: K e = halfᵀ w, and K S Kᵀ = halfᵀ half
+            for c in range(channels):
+                for z in range(size):
+                    x[z] += half[c, z] * w[c]
             for z in range(size):
                 for c in range(channels):
-                    x[z] += half[z, c] * w[c]
-            for z in range(size):
-                for y in range(size):
-                    value = 0.0
-                    for c in range(channels):
-                        value += half[z, c] * half[y, c]
-                    p[z, y] -= value
+                    factor = half[c, z]
+                    for y in range(size):
+                        p[z, y] -= factor * half[c, y]
             # Predict the next state and its covariance.
             a = states[run, i]
             for z in range(size):
@@ -208,13 +206,14 @@ def run_filter(
             propagate_covariance(a, p, work, spread)
             lost = False
             for z in range(size):
+                spread[z, z] += jumps[run, i, z]
+                for e in range(count):
+                    g = forces[run, i, z, e] * deviations[run, e] * deviations[run, e]
+                    if g != 0.0:
+                        for y in range(z + 1):
+                            spread[z, y] += g * forces[run, i, y, e]
                 for y in range(z + 1):
-                    value = spread[z, y] + (jumps[run, i, z] if z == y else 0.0)
-                    for e in range(count):
-                        g = forces[run, i, z, e]
-                        if g != 0.0:
-                            q = deviations[run, e]
-                            value += g * forces[run, i, y, e] * q * q
+                    value = spread[z, y]
                     p[z, y] = value
                     p[y, z] = value
                     if not abs(value) < limits[0]:
@@ -247,7 +246,6 @@ def run_smoother(
     spread: Array,
     work: Array,
     back: Array,
-    transposed: Array,
     closed: Array,
     weighed: Array,
 ) -> None:
@@ -285,7 +283,6 @@ def run_smoother(
         spread: (Z, Z) propagated Λ.
         work: (Z, Z) product.
         back: (Z, Z) A C.
-        transposed: (Z, Z) transpose of `back`.
         closed: (Z, Z) C.
         weighed: (C, Z) W H.
     """
@@ -301,23 +298,29 @@ def run_smoother(
             multiply_sparse(whitener, h, weighed)
             if i + 1 < samples:
                 # Carry λ and Λ from the next sample to this one; closed = I - K H.
-                multiply_sparse(gains[run, i], h, closed)
                 for z in range(size):
                     for y in range(size):
-                        closed[z, y] = (1.0 if z == y else 0.0) - closed[z, y]
+                        closed[z, y] = 1.0 if z == y else 0.0
+                for c in range(channels):
+                    for y in range(size):
+                        factor = h[c, y]
+                        if factor != 0.0:
+                            for z in range(size):
+                                closed[z, y] -= gains[run, i, z, c] * factor
                 multiply_sparse(states[run, i], closed, back)
                 for z in range(size):
-                    value = 0.0
-                    for y in range(size):
-                        value += back[y, z] * adjoint[y]
-                        transposed[z, y] = back[y, z]
-                    moved[z] = value
+                    moved[z] = 0.0
+                for y in range(size):
+                    for z in range(size):
+                        moved[z] += back[y, z] * adjoint[y]
                 for z in range(size):
                     adjoint[z] = moved[z]
-                propagate_covariance(transposed, information, work, spread)
+                multiply_sparse(information, back, work)
+                multiply_transposed(back, work, spread)
                 for z in range(size):
-                    for y in range(size):
+                    for y in range(z, size):
                         information[z, y] = spread[z, y]
+                        information[y, z] = spread[z, y]
             # Add what the reading of this sample says.
             for c in range(channels):
                 value = 0.0
@@ -332,10 +335,10 @@ def run_smoother(
                         for y in range(size):
                             information[z, y] += factor * weighed[c, y]
             for z in range(size):
-                value = predicted[run, i, z]
-                for y in range(size):
-                    value -= covariances[run, i, z, y] * adjoint[y]
-                smoothed[run, i, z] = value  # (6)
+                smoothed[run, i, z] = predicted[run, i, z]
+            for y in range(size):
+                for z in range(size):
+                    smoothed[run, i, z] -= covariances[run, i, y, z] * adjoint[y]  # (6)
             if i == 0:
                 break
             # Missing force between the previous sample and this one, and what it adds to (7).
@@ -346,7 +349,8 @@ def run_smoother(
                     if g[z, e] != 0.0:
                         pushed += g[z, e] * adjoint[z]
                         for y in range(size):
-                            known += g[z, e] * information[z, y] * g[y, e]
+                            if g[y, e] != 0.0:
+                                known += g[z, e] * information[z, y] * g[y, e]
                 q = deviations[run, e]
                 missing[run, i - 1, e] = -q * q * pushed
                 measured[e] += pushed * pushed
@@ -360,12 +364,12 @@ COMPILED = CompiledFunctions(
         run_filter: (
             *("bizz", "biz", "bize", "btcz", "btc", "biz", "btc", "z", "be", "1"),
             *("btz", "btzz", "btc", "btzc", "btcc", "b"),
-            *("z", "z", "zz", "zz", "zz", "cc", "cc", "zc", "zc", "c"),
+            *("z", "z", "zz", "zz", "zz", "cc", "cc", "cz", "cz", "c"),
         ),
         run_smoother: (
             *("bizz", "bize", "btcz", "be", "btz", "btzz", "btc", "btzc", "btcc"),
             *("btz", "bie", "e", "e"),
-            *("z", "z", "c", "zz", "zz", "zz", "zz", "zz", "zz", "cz"),
+            *("z", "z", "c", "zz", "zz", "zz", "zz", "zz", "cz"),
         ),
     },
 )

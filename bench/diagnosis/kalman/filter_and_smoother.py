@@ -64,6 +64,11 @@ MAX_ITERATIONS = 12
 """Maximum number of iterations of (7)."""
 CONVERGENCE_TOLERANCE = 0.15
 """Maximum relative change of the standard deviations at which (7) has converged."""
+MIN_ITERATION_GAIN = 0.3
+"""Minimum change of the log-likelihood by an iteration of (7) for which another one follows.
+
+The variance of a force that is not missing tends to zero ever more slowly, which gains nothing.
+"""
 SMALLEST_FORCE = 1e-6
 """Minimum standard deviation of a missing force, as a share of the typical force."""
 STACKED = ("states", "defects", "forces", "inputs", "readings", "jumps")
@@ -333,7 +338,8 @@ def fit_process_noise(
     """Fit the standard deviations of the missing forces (process noise) by maximum likelihood.
 
     Each iteration filters and smooths the runs, and multiplies each variance by the ratio of its
-    smoothed to its expected square, eq. (7) of the module docstring.
+    smoothed to its expected square, eq. (7) of the module docstring. It ends when neither the
+    variances nor the likelihood change much.
 
     Args:
         runs: the linear models.
@@ -349,9 +355,13 @@ def fit_process_noise(
     # Short segments in parallel need fewer steps, and show the same process noise.
     is_long = runs.residuals.shape[1] > 2 * SEGMENT_SAMPLES
     fitted_runs = runs.segments(SEGMENT_SAMPLES) if is_long else runs
+    log_likelihood = -np.inf
     for _ in range(MAX_ITERATIONS):
         filtered = filter_runs(fitted_runs, force, white)
         smoothed = smooth_runs(fitted_runs, filtered, force)
+        last, log_likelihood = log_likelihood, float(filtered.log_likelihood.sum())
+        if abs(log_likelihood - last) < MIN_ITERATION_GAIN:
+            break
         # Scores after the first `count` are those of coloured noise, whose variance is known.
         ratio = np.clip(np.sqrt(smoothed.score[:count]), 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
         new_force = np.maximum(force * ratio, SMALLEST_FORCE * typical)
