@@ -379,10 +379,14 @@ class EffectSearch(ScoredModelSet):
         starts = []
         for name in names:
             # Zero coefficients switch the effect off, and they are not fitted; all else starts as
-            # it is.
+            # it is, except richer laws that contain this one and act in its place.
             theta = model.fit.theta.copy()
-            theta[self.evaluator.coefficient_slices[name]] = 0.0
             remaining_effects = tuple(n for n in model.effects if n != name)
+            for richer_law in remaining_effects:
+                contained_slices = self._find_contained_slices(richer_law)
+                if name in contained_slices:
+                    theta[contained_slices[name]] += theta[self.evaluator.coefficient_slices[name]]
+            theta[self.evaluator.coefficient_slices[name]] = 0.0
             known_jacobian = model.fit.get_known_jacobian().drop_parameters(
                 self.evaluator.get_coefficient_indices(name)
             )
@@ -455,26 +459,36 @@ class EffectSearch(ScoredModelSet):
     def _split_into_contained_laws(self, model: FittedModel, name: str) -> EffectStarts:
         """Return the simpler laws that an effect contains, with its fitted coefficients.
 
+        Args:
+            model: fitted model: its effects, parameters, initial states and likelihood.
+            name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        """
+        slices = self._find_contained_slices(name)
+        return {law: model.fit.theta[indices] for law, indices in slices.items()}
+
+    def _find_contained_slices(self, name: str) -> dict[str, slice]:
+        """Return the simpler laws that an effect contains, with the places of their coefficients.
+
         For example, Stribeck friction contains Coulomb friction. The scaling coefficients of the
         contained laws come first among the coefficients of the effect, in the order in which it
         names the laws.
 
         Args:
-            model: fitted model: its effects, parameters, initial states and likelihood.
             name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+
+        Returns:
+            For each law, where its coefficients are in theta as those of this effect.
         """
         effects = self.evaluator.available_effects
-        coefficient_slices = self.evaluator.coefficient_slices
-        coefficients = model.fit.theta[coefficient_slices[name]]
-        laws: EffectStarts = {}
-        begin = 0
+        slices = dict[str, slice]()
+        begin = self.evaluator.coefficient_slices[name].start
         for law in effects[name].contains:
             # A contained effect at another place is a member of a family, and not a simpler law.
             if law in effects and effects[law].place == effects[name].place:
                 end = begin + len(self.evaluator.get_coefficient_indices(law))
-                laws[law] = coefficients[begin:end]
+                slices[law] = slice(begin, end)
                 begin = end
-        return laws
+        return slices
 
     def _find_dominant_member(self, model: FittedModel, name: str) -> Iterator[EffectStarts]:
         """Yield the member of a family that changes the runs most, with its coefficients.

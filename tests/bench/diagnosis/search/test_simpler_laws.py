@@ -99,3 +99,20 @@ def test_a_simpler_law_that_is_known_and_caught_is_fitted_from_the_richer_one():
     plainer = made.simplify_laws(richer)
     assert set(plainer.effects) == {"force.bias", "friction.coulomb"}
     assert plainer.penalised_log_likelihood > caught.penalised_log_likelihood + 45.0
+
+
+def test_a_removed_law_continues_in_a_richer_one_that_contains_it(monkeypatch):
+    """Without its coefficient, the richer law would begin with far too little friction."""
+    made = search({"friction.stribeck": (0.5, 0.9, 0.3), "force.bias": 0.4})
+    names = ("friction.coulomb", "friction.stribeck", "force.bias")
+    values = {"friction.coulomb": 0.3, "friction.stribeck": (0.2, 0.9, 0.3), "force.bias": 0.4}
+    model, starts, refit = fitted(made, names, values), [], made.refit_models
+    split = model.fit.theta[[made.evaluator.coefficient_slices[name].start for name in names[:2]]]
+    monkeypatch.setattr(made, "refit_models", lambda new: (starts.extend(new), refit(new)))
+    kept = made.drop_unneeded_effects(model)
+    (start,) = (start for start in starts if start.effects == names[1:])
+    first = made.evaluator.coefficient_slices["friction.stribeck"].start
+    assert start.theta[first] == pytest.approx(split.sum())
+    assert start.theta[made.evaluator.coefficient_slices["friction.coulomb"]] == 0.0
+    assert set(kept.effects) == {"friction.stribeck", "force.bias"}
+    np.testing.assert_allclose(kept.fit.theta[first : first + 2], (0.5, 0.9), rtol=0.1)
