@@ -113,7 +113,8 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
        runs. Sets that do not act at all joints where forces are missing are skipped.
     3. If none explains the runs, fit all servos together (without dry friction only).
     4. If that does not help either, extend the likeliest set by further effects, and fit it: two
-       effects together may explain what neither explains alone.
+       effects together may explain what neither explains alone. This is not done if its effect
+       replaces little of any missing force, because it then imitates one that the library lacks.
 
     If no effect gains enough in step 1, dry friction is fitted alone.
 
@@ -151,7 +152,8 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
         check_filter(context, larger_sets[0].followed.log_likelihood)
         best = select_likeliest(best, _fit_all_servos(context, larger_sets[0]))
     # Step 4.
-    if larger_sets and not is_explained(context, best) and not search_control.is_over():
+    may_grow = bool(larger_sets) and not _is_imitation(current, larger_sets[0])
+    if may_grow and not is_explained(context, best) and not search_control.is_over():
         best = select_likeliest(best, fit_filtered(context, _grow_set(context, larger_sets[0])))
     if not np.isfinite(best.fit.cost) or not best.effects:
         return base
@@ -178,11 +180,10 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
         larger = _list_larger_that_pay(context, current) if is_force_missing else []
         if not larger:
             break
-        # An effect that replaces little of a force imitates another one. The next may be the right
-        # one; if it is not, the library lacks it.
-        is_imitation = _compute_remaining_share(current, larger[0]) > MAX_REMAINING_FORCE_SHARE
+        # After an imitation, the next effect may be the right one; if it is not, the library lacks
+        # it.
+        imitations = imitations + 1 if _is_imitation(current, larger[0]) else 0
         current = larger[0]
-        imitations = imitations + 1 if is_imitation else 0
         start = make_filtered_start(context, current)
         if imitations == MAX_IMITATIONS or has_noise_like_cost(
             context, select_lowest_of_each(context, [start])
@@ -314,6 +315,16 @@ def _compute_remaining_share(current: FilteredSet, larger: FilteredSet) -> float
     missing = current.followed.missing_forces
     shares = larger.followed.force[missing] / current.followed.force[missing]
     return float(shares.min(initial=np.inf))
+
+
+def _is_imitation(current: FilteredSet, larger: FilteredSet) -> bool:
+    """Return whether the last effect of a set imitates another one: it replaces no missing force.
+
+    Args:
+        current: the set without this effect.
+        larger: the set with it.
+    """
+    return _compute_remaining_share(current, larger) > MAX_REMAINING_FORCE_SHARE
 
 
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:

@@ -90,3 +90,35 @@ def test_a_set_grows_while_effects_replace_missing_forces(
     monkeypatch.setattr(forward_selection, "make_filtered_start", lambda *_: None)
     monkeypatch.setattr(forward_selection, "select_lowest_of_each", lambda *_: [])
     assert len(forward_selection._grow_set(None, sets[0]).names) == expected_size
+
+
+@pytest.mark.parametrize(("remaining_force", "is_grown"), [(0.5, True), (0.8, False)])
+def test_nothing_is_added_to_an_effect_that_replaces_no_missing_force(
+    monkeypatch, remaining_force, is_grown
+):
+    """The library then lacks the cause, and each further effect takes several filters."""
+    base = SimpleNamespace(effects=(), fit=SimpleNamespace(cost=2.0))
+    model = SimpleNamespace(effects=("a",), fit=SimpleNamespace(cost=1.0))
+    largest, grown = _follow(("a",), 50.0, remaining_force), []
+    context = SimpleNamespace(
+        evaluator=SimpleNamespace(search_control=SimpleNamespace(is_over=lambda: False)),
+        search=SimpleNamespace(base_model=base),
+        filters=SimpleNamespace(
+            empty_set=_follow((), 0.0, 1.0), act_where_forces_are_missing=lambda _: True
+        ),
+    )
+    for name, value in {
+        "_list_larger_that_pay": lambda *_: [largest],
+        "_select_nearly_as_likely": lambda *_: [largest],
+        "_fit_all_servos": lambda *_: base,
+        "_grow_set": lambda _, current: grown.append(current) or current,
+        "select_likeliest": lambda *models: models[-1],
+        "fit_filtered": lambda *_: model,
+        "is_explained": lambda *_: False,
+        "check_filter": lambda *_: None,
+        "check_fit": lambda *_: None,
+        "remove_idle_effects": lambda _, best: best,
+    }.items():
+        monkeypatch.setattr(forward_selection, name, value)
+    forward_selection.select_in_model(context)
+    assert grown == ([largest] if is_grown else [])
