@@ -69,6 +69,7 @@ def make_robot_simulator(
     actuators: Mapping[str, Any] | None = None,
     engine: Mapping[str, Any] | None = None,
     free: Sequence[str] = (),
+    description: Path | None = None,
 ) -> type[Simulator]:
     """Make the simulator of a robot's model file.
 
@@ -77,6 +78,7 @@ def make_robot_simulator(
         actuators: actuators that the file lacks, as in a recording's description.
         engine: time step and integrator if they differ from the file's.
         free: numbers of the file to tune, such as ``damping@*``.
+        description: file that states all this, for messages; None if there is none.
 
     Raises:
         InputError: the file cannot be used, or something requested does not exist in it.
@@ -85,7 +87,8 @@ def make_robot_simulator(
     from sims.robot.parsing.read_model_file import read_robot
     from sims.robot.robot_simulator import make_robot_simulator
 
-    return make_robot_simulator(read_robot(Path(path), actuators=actuators, engine=engine), free)
+    robot = read_robot(Path(path), actuators=actuators, engine=engine, description=description)
+    return make_robot_simulator(robot, free)
 
 
 def load_plugins(paths: str | Path | Iterable[str | Path]) -> None:

@@ -101,7 +101,8 @@ def get_simulator_class(
     if reference is not None and system is None:
         engine = {**reference.engine, **({"fix_base": True} if fix_base else {})}
         return make_robot_simulator(
-            reference.path, reference.actuators, engine, free or reference.free
+            *(reference.path, reference.actuators, engine, free or reference.free),
+            reference.description,
         )
     name = system or (source.system if isinstance(source, Recording) else read_system_name(path))
     return _find_system(path, name)
@@ -211,7 +212,9 @@ def _get_simulator_class(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
     """
     file = get_model_reference(Path(name), meta)
     if file is not None:
-        return make_robot_simulator(file.path, file.actuators, file.engine, file.free)
+        return make_robot_simulator(
+            file.path, file.actuators, file.engine, file.free, file.description
+        )
     system = meta.get("system")
     if not isinstance(system, str):
         raise InputError(

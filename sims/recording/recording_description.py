@@ -133,12 +133,14 @@ class ModelFileReference:
         engine: Time step and integrator, where they differ from those of the file, and floating
             joints whose pose is recorded.
         free: Unknown parameters that are estimated unless others are requested.
+        description: File that states all this, for messages; None if there is none.
     """
 
     path: Path
     actuators: Mapping[str, Any]
     engine: Mapping[str, Any]
     free: tuple[str, ...] = ()
+    description: Path | None = None
 
 
 def read_model_reference(
@@ -186,7 +188,7 @@ def get_model_reference(
     if bases and not engine.get("fix_base"):
         engine["recorded_bases"] = bases
     free = check_name_list(description, "free", meta.get("free", []), 'names, as ["damping@*"]')
-    return ModelFileReference(Path(model), actuators, engine, free)
+    return ModelFileReference(Path(model), actuators, engine, free, description)
 
 
 def read_system_name(path: str | Path) -> str:

@@ -10,6 +10,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from sims.core.files import require_file
 from sims.core.freed_memory import release_free_memory
 from sims.core.plain_values import MAX_NUMBER, truncate_text
 from sims.core.simulator import InputError
@@ -53,6 +54,7 @@ def read_robot(
     *,
     actuators: Mapping[str, Any] | None = None,
     engine: Mapping[str, Any] | None = None,
+    description: Path | None = None,
 ) -> RobotModel:
     """Read the robot of a model file, without printing or writing anything.
 
@@ -61,6 +63,8 @@ def read_robot(
         actuators: actuators to add, by name: tables as in a recording's ``[actuators.NAME]``.
         engine: ``timestep`` (s) and ``integrator`` that replace those of the file, whether to
             ``fix_base``, and ``recorded_bases``, the floating joints whose pose is recorded.
+        description: file that states the path and these tables, for messages; None if there is
+            none.
 
     Returns:
         The robot, with a note for everything that was repaired or omitted.
@@ -69,7 +73,8 @@ def read_robot(
         InputError: the file cannot be read, or MuJoCo rejects it; one line with file and cause.
     """
     path = Path(path)
-    files = ModelFileReader(path)
+    require_file(path, f"the model that {description} states" if description else "")
+    files = ModelFileReader(path, description)
     try:
         root = parse_tree(files, path)
         kind = FORMAT_BY_ROOT.get(root.tag)
@@ -138,8 +143,9 @@ def _make_robot(
         mjcf_loading.read_referenced_files(files, root)
         spec = _parse_repaired_file(files, root)
     # 2. Additions.
-    rate_controlled = added_actuators.add_actuators(spec, actuators, source)
-    notes += apply_engine_settings(spec, engine, source)
+    tables_source = str(files.description or source)
+    rate_controlled = added_actuators.add_actuators(spec, actuators, tables_source)
+    notes += apply_engine_settings(spec, engine, tables_source)
     notes += element_names.name_unnamed_elements(spec)
     bases, base_notes = floating_bases.separate_floating_joints(
         spec, () if engine.get("fix_base") else engine.get("recorded_bases", ()), source

@@ -24,6 +24,9 @@ MAX_ASSET_BYTES = 500 * 2**20
 MAX_ELEMENT_DEPTH = 400
 """Maximum nesting depth of XML elements."""
 
+SCHEMA_REMEDY = "; correct or remove it (MuJoCo's XML reference lists what is allowed)"
+"""End of MuJoCo's messages about an unknown element or attribute."""
+
 
 @dataclass
 class ModelFileReader:
@@ -31,6 +34,7 @@ class ModelFileReader:
 
     Attributes:
         path: the model file; included files are relative to its folder.
+        description: file that states additions to the model, for messages; None if there is none.
         places: file and line of each element.
         included: the model file and all included files.
         size: total size of these files in bytes.
@@ -39,6 +43,7 @@ class ModelFileReader:
     """
 
     path: Path
+    description: Path | None = None
     places: dict[Element, str] = field(default_factory=dict)
     included: list[Path] = field(default_factory=list)
     size: int = 0
@@ -63,7 +68,8 @@ class ModelFileReader:
         line = re.search(r", line (\d+)", message)
         number = int(line[1]) if line else 0
         element = self.given[number - 1] if 0 < number <= len(self.given) else None
-        return self.make_error(element, re.sub(r", line \d+", "", message))
+        remedy = SCHEMA_REMEDY if message.startswith("Schema violation") else ""
+        return self.make_error(element, re.sub(r", line \d+", "", message) + remedy)
 
     def read_content(self, path: Path, max_bytes: int) -> bytes:
         """Read a file, and add its bytes to the digest.

@@ -160,3 +160,22 @@ def test_what_mujoco_warns_of_is_a_note(write, tmp_path, monkeypatch, capfd):
     assert "settotalmass" in warning
     assert capfd.readouterr() == ("", "")
     assert os.listdir(tmp_path) == ["robot.xml"]
+
+
+def test_messages_name_the_file_that_is_wrong(write, tmp_path):
+    """Tables of a recording stand in its description, not in the model file."""
+    description, path = tmp_path / "swing.toml", write(mjcf())
+    with pytest.raises(InputError) as caught:
+        read_robot(path, engine={"timestep": "often"}, description=description)
+    assert str(caught.value).startswith(f"{description}: engine.timestep: expected a number")
+    with pytest.raises(InputError) as caught:
+        read_robot(path, actuators={"m": {"joint": "k"}}, description=description)
+    assert str(caught.value).startswith(f"{description}: ")
+    with pytest.raises(InputError) as caught:
+        read_robot(tmp_path / "robt.xml", description=description)
+    assert str(caught.value) == (
+        f"{tmp_path / 'robt.xml'}: no such file; expected the model that {description} states; "
+        "did you mean robot.xml?"
+    )
+    with pytest.raises(InputError, match="correct or remove it"):
+        read_robot(write(mjcf("<wheel/>")))
