@@ -6,6 +6,7 @@ import os
 
 import pytest
 
+from bench.logs.recording_loading import get_simulator_class
 from sims.core.simulator import InputError
 from sims.robot.parsing import xml_files
 from sims.robot.parsing.read_model_file import read_robot
@@ -179,3 +180,7 @@ def test_messages_name_the_file_that_is_wrong(write, tmp_path):
     )
     with pytest.raises(InputError, match="correct or remove it"):
         read_robot(write(mjcf("<wheel/>")))
+    write(mjcf())
+    description.write_text('model = "robot.xml"\n[engine]\ntimestep = "often"\n')
+    with pytest.raises(InputError, match=r"swing\.toml: engine\.timestep: expected a number"):
+        get_simulator_class(tmp_path / "swing.csv")
