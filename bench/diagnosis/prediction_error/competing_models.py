@@ -124,6 +124,34 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     return select_likeliest(fit_competing_models(context, single), best)
 
 
+def replace_time_shifts(context: SearchContext, best: FittedModel) -> FittedModel:
+    """Return a model with another delay or lag in place of one of its own, if that is likelier.
+
+    A filter does not follow late readings, so that a regression confuses delays with lags. Further
+    effects would only imitate the difference.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model so far, which does not explain the runs.
+    """
+    evaluator = context.evaluator
+    starts = [
+        make_replacing_start(
+            evaluator, best, [name], similar, best.fit.theta[evaluator.coefficient_slices[name]]
+        )
+        for name in best.effects
+        for similar in list_similar_shifts(evaluator, name)
+        if similar not in best.effects
+    ]
+    if not starts or has_series(evaluator, best.effects):
+        return best
+    ((_, start), *_) = select_lowest_of_each(context, starts)
+    fitted = context.search.fit_one(start)
+    if not fitted.penalised_log_likelihood > best.penalised_log_likelihood:
+        return best
+    return remove_idle_effects(context, fitted)
+
+
 def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedModel:
     """Fit the sets that are nearly as good by the regression, and return the best of all.
 

@@ -47,6 +47,7 @@ from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
 from bench.diagnosis.prediction_error.competing_models import (
     fit_competing_models,
     fit_single_in_place,
+    replace_time_shifts,
 )
 from bench.diagnosis.prediction_error.dry_friction_fits import (
     check_fit,
@@ -211,8 +212,9 @@ class PredictionErrorSearch(EffectSearch):
         1. single effects of a robot on the ground, by the residual of simulations;
         2. likely effects alone, if servos reach their limits (otherwise after 4);
         3. identification servo by servo, after which nothing else is done if it succeeds;
-        4. dry friction alone, then the set that regression selects, then the set that regressions
-           with dry friction of all joints in the model select;
+        4. dry friction alone, then the set that regression selects, with a lag in place of a delay
+           or the reverse, then the set that regressions with dry friction of all joints in the
+           model select;
         5. effects with many shapes, such as forces of any period;
         6. series effects (elastic or slack transmissions) that remove most of the residual;
         7. effects that regression missed: singly, then one by one in addition to others;
@@ -251,6 +253,8 @@ class PredictionErrorSearch(EffectSearch):
             if friction.effects and is_nearly_explained(context, friction):
                 check_fit(context, friction)
             best = select_likeliest(best, fit_quick_selection(context, selected))
+        if self._should_continue(best):
+            best = replace_time_shifts(context, best)
         if self._should_continue(best):
             best = select_likeliest(best, select_with_friction(context, selected))
         if self._should_continue(best) and not has_jumps:

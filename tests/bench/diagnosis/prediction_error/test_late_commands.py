@@ -10,6 +10,7 @@ import pytest
 
 from bench.diagnosis import explain as explaining
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
+from tests.exams.robots.robot_cases import RobotQuestion
 
 NOISE, STEP, INTERVAL = 5e-4, 0.002, 0.01
 ARM = """
@@ -116,3 +117,20 @@ def test_a_short_delay_of_all_commands_and_of_all_readings_are_equivalent(tmp_pa
     found = explaining.explain(path)
     (cause,) = found.causes
     assert {cause.effect, *cause.alternatives} == {"input.delay@*", "sensor.delay@*"}
+
+
+@pytest.mark.slow
+def test_a_lag_that_the_regression_takes_for_a_delay_is_found_without_further_effects(
+    tmp_path, monkeypatch
+):
+    """Effects that are added to the delay would only imitate its difference from the lag."""
+    monkeypatch.setattr(
+        "bench.diagnosis.prediction_error.prediction_error_search.add_to_model",
+        lambda *_: pytest.fail("effects were added to the delay"),
+    )
+    case = RobotQuestion("double", "arm2-servo", "any", 1).draw()
+    found = explaining.explain(case.write(tmp_path))
+    assert {cause.effect for cause in found.causes} == {"input.lag@m_elbow", "friction.load@elbow"}
+    for cause in found.causes:
+        (number,) = cause.coefficients.values()
+        assert number.value == pytest.approx(*case.effects[cause.effect], rel=0.05)
