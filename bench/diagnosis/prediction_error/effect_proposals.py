@@ -25,10 +25,12 @@ from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.effects_at_joints import (
     JOINT_MODEL,
+    LINK_MODEL,
     SERVO_MODEL,
     SET_POINT_MODEL,
     get_joint_name,
     get_servo_input,
+    list_moved_bodies,
     list_similar_shifts,
 )
 from bench.diagnosis.prediction_error.filters_with_effects import (
@@ -344,7 +346,7 @@ class EffectProposals:
         return max((self._compute_likelihood_step(base, name)[1] for name in others), default=0.0)
 
     def _list_effects_at(self, joint: int) -> list[str]:
-        """Return names of the effects of the joint model of a joint, and of its servo's model.
+        """Return names of the effects of the models of a joint, its link and its servo.
 
         Effects of all commands are added if no drive acts at the joint alone. Effects that the
         library does not have are left out.
@@ -356,6 +358,7 @@ class EffectProposals:
         place = get_joint_name(evaluator, joint)
         servo = get_servo_input(evaluator, joint).removeprefix("u.")
         names = [f"{effect}@{place}" for effect in JOINT_MODEL]
+        names += [f"{effect}@{list_moved_bodies(evaluator)[joint]}" for effect in LINK_MODEL]
         names += [f"{effect}@{servo}" for effect in SERVO_MODEL + SET_POINT_MODEL]
         if not getattr(evaluator.simulator.system, "drives", {}).get(joint):
             names += COMMAND_MODEL

@@ -16,6 +16,8 @@ from sims.robot.robot_simulator import RobotSimulator
 
 JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")
 """Effects of the standard joint model, tried at the joint with the largest missing force."""
+LINK_MODEL = ("inertia.scale",)
+"""Effects of the link that the joint moves, whose inertia acts nearly as the armature does."""
 SERVO_MODEL = ("actuator.stiffness", "actuator.damping")
 """Effects of the standard servo model, tried at the servo of the same joint."""
 SET_POINT_MODEL = ("servo.derivative",)
@@ -126,7 +128,10 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
     """
     joints = _list_joints(evaluator, name)
     if evaluator.available_effects[name].at == "body":
-        joints = _list_joints_of_body(evaluator, name.partition("@")[2])
+        body = name.partition("@")[2]
+        joints = {
+            joint for joint, moved in enumerate(list_moved_bodies(evaluator)) if moved == body
+        }
     return {
         other
         for other in evaluator.library
@@ -175,21 +180,17 @@ def is_time_shift(effect: Effect) -> bool:
     return [c.of for c in effect.coefficients] == ["shift"]
 
 
-def _list_joints_of_body(evaluator: RunEvaluator, body: str) -> set[int]:
-    """Return the indices of the joints that move a body against its parent body.
+def list_moved_bodies(evaluator: RunEvaluator) -> list[str]:
+    """Return the name of the body that each joint moves against its parent body.
 
     The inertia of such a body and the armature of its joint may have the same effect.
 
     Args:
         evaluator: the runs of a robot.
-        body: name of the body; empty for an effect at all bodies.
     """
     assert isinstance(evaluator.simulator, RobotSimulator)
     model = evaluator.simulator.robot.compiled
-    moved_bodies = [
-        model.body(b).name for b in model.dof_bodyid[evaluator.simulator.addresses.velocities]
-    ]
-    return {joint for joint, moved_body in enumerate(moved_bodies) if moved_body == body}
+    return [model.body(b).name for b in model.dof_bodyid[evaluator.simulator.addresses.velocities]]
 
 
 def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:

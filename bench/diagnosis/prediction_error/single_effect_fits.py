@@ -19,6 +19,7 @@ from bench.diagnosis.prediction_error.dry_friction_fits import check_filter, che
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.effects_at_joints import (
     JOINT_MODEL,
+    LINK_MODEL,
     SERVO_MODEL,
     SET_POINT_MODEL,
     acts_at_joint,
@@ -198,7 +199,8 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
-    starts = context.proposals.list_alone(len(JOINT_MODEL + SERVO_MODEL + SET_POINT_MODEL))
+    models_at_joint = JOINT_MODEL + LINK_MODEL + SERVO_MODEL + SET_POINT_MODEL
+    starts = context.proposals.list_alone(len(models_at_joint))
     if not starts:
         return search.base_model
     fitted, best = list[FittedModel](), search.base_model
