@@ -63,8 +63,8 @@ def read_robot(
         actuators: actuators to add, by name: tables as in a recording's ``[actuators.NAME]``.
         engine: ``timestep`` (s) and ``integrator`` that replace those of the file, whether to
             ``fix_base``, and ``recorded_bases``, the floating joints whose pose is recorded.
-        description: file that states the path and these tables, for messages; None if there is
-            none.
+        description: file that states the path and these tables, for messages; None without
+            one.
 
     Returns:
         The robot, with a note for everything that was repaired or omitted.
