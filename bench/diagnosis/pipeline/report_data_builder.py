@@ -167,8 +167,10 @@ def _assess_identifiability(search: EffectSearch) -> tuple[ParameterIdentifiabil
     """Assess identifiability from the responses of the runs to effects (directions).
 
     The search has computed them about the base model, on their own or together with scores. If it
-    has not, the result is empty.
+    has not, the result is empty. It is the last that is asked of the search, so its memory is
+    released first.
     """
+    search.release_memory()
     directions = search.get_known_directions()
     if directions is None:
         # The base model has no effects.

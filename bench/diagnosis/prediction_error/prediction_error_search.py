@@ -615,13 +615,18 @@ class PredictionErrorSearch(EffectSearch):
             return start
         return replace(start, known_jacobian=self._search_context.columns.sensitivities(start))
 
+    def release_memory(self) -> None:
+        """Release the regressions, which only the search needs; they may take most of the memory.
+
+        Scores about the base model that were not computed before are None afterwards.
+        """
+        self._search_context.columns.release_regressions()
+
     def get_known_directions(self) -> tuple[TrajectoryFit, DirectionSet] | None:
         """Return the fit of the base model, and first-order changes of its runs by every candidate.
 
-        They are linearised about the measured motion. The regressions are released first: the
-        report asks for directions last, and both together would need the most memory.
+        They are linearised about the measured motion.
         """
-        self._search_context.columns.release_regressions()
         library = self._search_context.columns.library
         base = self._search_context.filters.base
         values = compute_sensitivities(base, library, np.float32)

@@ -113,6 +113,9 @@ class ScoredModelSet(ModelSet):
             return self.scores_by_effects.get(key)
         return self.superseded_scans[key].scores
 
+    def release_memory(self) -> None:
+        """Release what only the search itself needs; here nothing."""
+
     def get_known_directions(self) -> tuple[TrajectoryFit, DirectionSet] | None:
         """Return the directions of all candidates about the base model, if already computed.
 
