@@ -51,6 +51,8 @@ FURTHER_STEPS = 4
 """Maximum number of further Gauss-Newton steps of a competing model that has improved much."""
 MAX_COMPETING_EFFECTS = 5
 """Maximum number of competing models of each effect that are fitted by simulation."""
+MAX_RICHER_LAWS = 3
+"""Maximum number of richer laws that are fitted in place of a law."""
 COMPETING_FACTORS = (0.5, 0.8, 1.0, 1.25, 2.0)
 """Factors of the regression coefficient at which a competing effect is simulated."""
 MAX_REFINED_EXCESS_SHARE = 0.25
@@ -147,6 +149,53 @@ def replace_time_shifts(context: SearchContext, best: FittedModel) -> FittedMode
         return best
     ((_, start), *_) = select_lowest_of_each(context, starts)
     fitted = context.search.fit_one(start)
+    if not fitted.penalised_log_likelihood > best.penalised_log_likelihood:
+        return best
+    return remove_idle_effects(context, fitted)
+
+
+def replace_by_richer_laws(context: SearchContext, best: FittedModel) -> FittedModel:
+    """Return a model with a richer law in place of one of its laws, if that is likelier.
+
+    Friction that depends on the position or the velocity looks like Coulomb friction at first, and
+    a selection that begins with the latter may not reach the richer law. The richer laws contain
+    the law, at the same place. Those with the largest gains by the regression about the model are
+    fitted, each with its best shape.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model so far, which does not explain the runs.
+    """
+    evaluator, starts = context.evaluator, list[FitStart]()
+    if not best.effects or not np.isfinite(best.fit.cost) or has_series(evaluator, best.effects):
+        return best
+    library = set(evaluator.library)
+    for name in best.effects:
+        place = evaluator.available_effects[name].place
+        richer = {
+            other
+            for other in library
+            if name in evaluator.available_effects[other].contains
+            and evaluator.available_effects[other].place == place
+        }
+        if not richer:
+            continue
+        regression, own_columns = context.columns.regression(best)
+        remaining = regression.make_regression_without(own_columns[name])
+        gains, tried = remaining.compute_net_gains(), list[str]()
+        for i in np.argsort(-gains, kind="stable").tolist():
+            group = remaining.groups[i]
+            if group.effect not in richer or group.effect in tried:
+                continue
+            tried.append(group.effect)
+            (solution,) = remaining.solve([group]).coefficients
+            coefficients = context.columns.coefficients(group, solution)
+            starts.append(make_replacing_start(evaluator, best, [name], group.effect, coefficients))
+            if len(tried) == MAX_RICHER_LAWS:
+                break
+    if not starts:
+        return best
+    fitted = select_likeliest(*context.search.fit_all(starts))
     if not fitted.penalised_log_likelihood > best.penalised_log_likelihood:
         return best
     return remove_idle_effects(context, fitted)

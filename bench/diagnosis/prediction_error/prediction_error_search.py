@@ -47,6 +47,7 @@ from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
 from bench.diagnosis.prediction_error.competing_models import (
     fit_competing_models,
     fit_single_in_place,
+    replace_by_richer_laws,
     replace_time_shifts,
 )
 from bench.diagnosis.prediction_error.dry_friction_fits import (
@@ -215,7 +216,8 @@ class PredictionErrorSearch(EffectSearch):
         4. dry friction alone, then the set that regression selects, with a lag in place of a delay
            or the reverse, then the set that regressions with dry friction of all joints in the
            model select;
-        5. effects with many shapes, such as forces of any period;
+        5. effects with many shapes, such as forces of any period, then richer laws in place of
+           those that leave a residual;
         6. series effects (elastic or slack transmissions) that remove most of the residual;
         7. effects that regression missed: singly, then one by one in addition to others;
         8. one effect in place of several;
@@ -264,6 +266,8 @@ class PredictionErrorSearch(EffectSearch):
             selected_with_shapes = context.columns.select_with_shapes(selected)
             best = select_likeliest(best, fit_quick_selection(context, selected_with_shapes))
             check_simple_friction(context, best)
+        if self._should_continue(best):
+            best = replace_by_richer_laws(context, best)
         series: list[RatedStart] | None = None
         if self._should_continue(best):
             series = simulate_series_effects(context, selected_with_shapes)
