@@ -78,7 +78,7 @@ def make_robot_simulator(
         actuators: actuators that the file lacks, as in a recording's description.
         engine: time step and integrator if they differ from the file's.
         free: numbers of the file to tune, such as ``damping@*``.
-        description: file that states all this, for messages; None if there is none.
+        description: file that states all this, for messages; None without one.
 
     Raises:
         InputError: the file cannot be used, or something requested does not exist in it.

@@ -101,7 +101,10 @@ def get_simulator_class(
     if reference is not None and system is None:
         engine = {**reference.engine, **({"fix_base": True} if fix_base else {})}
         return make_robot_simulator(
-            *(reference.path, reference.actuators, engine, free or reference.free),
+            reference.path,
+            reference.actuators,
+            engine,
+            free or reference.free,
             reference.description,
         )
     name = system or (source.system if isinstance(source, Recording) else read_system_name(path))

@@ -133,7 +133,7 @@ class ModelFileReference:
         engine: Time step and integrator, where they differ from those of the file, and floating
             joints whose pose is recorded.
         free: Unknown parameters that are estimated unless others are requested.
-        description: File that states all this, for messages; None if there is none.
+        description: File that states all this, for messages; None without one.
     """
 
     path: Path

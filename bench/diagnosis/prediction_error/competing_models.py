@@ -5,7 +5,7 @@ Each effect of the best set is replaced in turn by another one, or moved to anot
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +30,7 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
 )
 from bench.diagnosis.prediction_error.forward_selection_by_filters import try_one_more_effect
 from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
+from bench.diagnosis.prediction_error.regression_selection import Regression
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_filtered,
     is_explained,
@@ -45,6 +46,7 @@ from bench.diagnosis.prediction_error.single_effect_fits import (
     scale_effect,
 )
 from bench.diagnosis.search.alternative_causes import differ_in_one_effect
+from bench.diagnosis.search.score_test import DirectionGroup
 from sims.core.simulator import Array
 
 FURTHER_STEPS = 4
@@ -148,10 +150,7 @@ def replace_time_shifts(context: SearchContext, best: FittedModel) -> FittedMode
     if not starts or has_series(evaluator, best.effects):
         return best
     ((_, start), *_) = select_lowest_of_each(context, starts)
-    fitted = context.search.fit_one(start)
-    if not fitted.penalised_log_likelihood > best.penalised_log_likelihood:
-        return best
-    return remove_idle_effects(context, fitted)
+    return _select_improved(context, best, [context.search.fit_one(start)])
 
 
 def replace_by_richer_laws(context: SearchContext, best: FittedModel) -> FittedModel:
@@ -166,39 +165,30 @@ def replace_by_richer_laws(context: SearchContext, best: FittedModel) -> FittedM
         context: search, filters and regressions of the recording.
         best: the best model so far, which does not explain the runs.
     """
-    evaluator, starts = context.evaluator, list[FitStart]()
+    search, evaluator, starts = context.search, context.evaluator, list[FitStart]()
     if not best.effects or not np.isfinite(best.fit.cost) or has_series(evaluator, best.effects):
         return best
-    library = set(evaluator.library)
     for name in best.effects:
-        place = evaluator.available_effects[name].place
-        richer = {
-            other
-            for other in library
-            if name in evaluator.available_effects[other].contains
-            and evaluator.available_effects[other].place == place
-        }
-        if not richer:
+        richer_laws = [
+            law for law in evaluator.library if name in search.find_contained_slices(law)
+        ]
+        if not richer_laws:
             continue
         regression, own_columns = context.columns.regression(best)
         remaining = regression.make_regression_without(own_columns[name])
-        gains, tried = remaining.compute_net_gains(), list[str]()
-        for i in np.argsort(-gains, kind="stable").tolist():
-            group = remaining.groups[i]
-            if group.effect not in richer or group.effect in tried:
-                continue
-            tried.append(group.effect)
-            (solution,) = remaining.solve([group]).coefficients
-            coefficients = context.columns.coefficients(group, solution)
+        groups = [g for g, _ in _rank_effects(remaining) if g.effect in richer_laws]
+        for group in groups[:MAX_RICHER_LAWS]:
+            coefficients = context.columns.solve_alone(remaining, group)
             starts.append(make_replacing_start(evaluator, best, [name], group.effect, coefficients))
-            if len(tried) == MAX_RICHER_LAWS:
-                break
-    if not starts:
-        return best
-    fitted = select_likeliest(*context.search.fit_all(starts))
-    if not fitted.penalised_log_likelihood > best.penalised_log_likelihood:
-        return best
-    return remove_idle_effects(context, fitted)
+    return _select_improved(context, best, search.fit_all(starts)) if starts else best
+
+
+def _select_improved(
+    context: SearchContext, best: FittedModel, fits: Sequence[FittedModel]
+) -> FittedModel:
+    """Return the likeliest of some models without idle effects; `best` if none is likelier."""
+    likeliest = select_likeliest(best, *fits)
+    return best if likeliest is best else remove_idle_effects(context, likeliest)
 
 
 def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedModel:
@@ -367,31 +357,40 @@ def _find_competing_effects(
     evaluator = context.evaluator
     regression, own_columns = context.columns.regression(model)
     remaining = regression.make_regression_without(own_columns[name])
-    # Minus the penalties: effects with more coefficients gain more under the null hypothesis.
-    gains = remaining.compute_net_gains()
     own_gain = remaining.compute_gain(own_columns[name]) - context.filters.penalty(name)
     same_joint = list_joint_model_effects(evaluator, name)
     competing_effects, near_count = dict[str, _CompetingEffect](), 0
-    # In descending order of the gain, so the first group of an effect is its best shape.
-    for i in np.argsort(-gains, kind="stable").tolist():
-        group = remaining.groups[i]
-        effect, loss = group.effect, own_gain - float(gains[i])
+    for group, gain in _rank_effects(remaining):
+        effect, loss = group.effect, own_gain - gain
         # Forces of any shape are candidates too, but no effects of the library.
-        if effect not in evaluator.library or effect in (*model.effects, *competing_effects):
+        if effect not in evaluator.library or effect in model.effects:
             continue
         is_near = loss <= compute_comparison_margin(own_gain) and near_count < MAX_COMPETING_EFFECTS
-        is_promising = effect in same_joint and gains[i] > MIN_SAME_JOINT_GAIN_SHARE * own_gain
+        is_promising = effect in same_joint and gain > MIN_SAME_JOINT_GAIN_SHARE * own_gain
         # A law that contains this one never replaces it.
         if (is_near or is_promising) and name not in evaluator.available_effects[effect].contains:
             near_count += is_near
-            (solution,) = remaining.solve([group]).coefficients
-            coefficients = context.columns.coefficients(group, solution)
+            coefficients = context.columns.solve_alone(remaining, group)
             competing_effects[effect] = _CompetingEffect(effect, coefficients, loss)
     coefficients = model.fit.theta[evaluator.coefficient_slices[name]]
     for effect in list_similar_shifts(evaluator, name):
         if effect not in model.effects:
             competing_effects[effect] = _CompetingEffect(effect, coefficients, np.inf)
     return list(competing_effects.values())
+
+
+def _rank_effects(regression: Regression) -> list[tuple[DirectionGroup, float]]:
+    """Return the best shape of each effect of a regression with its gain, the largest gain first.
+
+    Gains are in twice the log-likelihood, minus the penalty of the effect: effects with more
+    coefficients gain more under the null hypothesis.
+    """
+    gains = regression.compute_net_gains()
+    best_of_each = dict[str, tuple[DirectionGroup, float]]()
+    for i in np.argsort(-gains, kind="stable").tolist():
+        group = regression.groups[i]
+        best_of_each.setdefault(group.effect, (group, float(gains[i])))
+    return list(best_of_each.values())
 
 
 def _confirm(

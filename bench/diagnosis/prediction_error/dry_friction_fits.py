@@ -144,8 +144,7 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
     if not friction_indices:
         return None
     best_group = groups[friction_indices[0]]
-    (solution,) = regression.solve([best_group]).coefficients
-    (coefficient,) = columns.coefficients(best_group, solution)
+    (coefficient,) = columns.solve_alone(regression, best_group)
     return context.filters.find_soft_friction(
         best_group.effect, float(np.copysign(1.0, coefficient))
     )

@@ -215,8 +215,7 @@ class EffectProposals:
             is_small = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
             if len(proposals) == MAX_SIMULATED_PROPOSALS or is_small:
                 break
-            (solution,) = regression.solve([group]).coefficients
-            proposals[group.effect] = self.columns.coefficients(group, solution)
+            proposals[group.effect] = self.columns.solve_alone(regression, group)
         return proposals
 
     def _propose_offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:

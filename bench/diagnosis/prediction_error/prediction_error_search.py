@@ -9,13 +9,14 @@ residual of a set is only noise. The order is:
     1. Select effects with few shapes by regression. If the selection leaves a large residual of a
        robot with servos, identify the servos (`servo_identification`), and do nothing of the
        following. Otherwise fit the dry friction among them first, because it is not linear where a
-       joint sticks (`dry_friction_fits`), and then the set (`simulated_fits`). If this fails, and
-       friction acts at all joints, select the other effects with it in the filter's model
-       (`selection_with_friction`). If this fails too, or before it if servos reach their limits,
-       simulate single effects at several coefficients, and fit the best of them
-       (`single_effect_fits`).
+       joint sticks (`dry_friction_fits`), and then the set (`simulated_fits`), also with a lag in
+       place of a delay or the reverse (`competing_models`). If this fails, and friction acts at all
+       joints, select the other effects with it in the filter's model (`selection_with_friction`).
+       If this fails too, or before it if servos reach their limits, simulate single effects at
+       several coefficients, and fit the best of them (`single_effect_fits`).
     2. If a force is still missing, select again, with effects of many shapes at the joints where it
-       is missing (`regression_columns`).
+       is missing (`regression_columns`), and try richer laws in place of those that leave a
+       residual (`competing_models`).
     3. Fit each of the effects with the largest gains alone, and those of the standard joint model
        (`single_effect_fits`, `effect_proposals`).
     4. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by

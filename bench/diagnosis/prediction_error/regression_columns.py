@@ -177,6 +177,16 @@ class LibraryColumns:
         """
         return group_coefficients(self.filters.evaluator, self.library.probes, group, solution)
 
+    def solve_alone(self, regression: Regression, group: DirectionGroup) -> Array:
+        """Return the coefficients (k,) of an effect that a regression fits alone.
+
+        Args:
+            regression: regression of innovations on columns of the library.
+            group: columns of the effect.
+        """
+        (solution,) = regression.solve([group]).coefficients
+        return self.coefficients(group, solution)
+
     def regression(self, model: FittedModel) -> ModelRegression:
         """Return the regression with the effects of a fitted model in the filter's model.
 

@@ -199,8 +199,8 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
-    models_at_joint = JOINT_MODEL + LINK_MODEL + SERVO_MODEL + SET_POINT_MODEL
-    starts = context.proposals.list_alone(len(models_at_joint))
+    effects_at_joint = JOINT_MODEL + LINK_MODEL + SERVO_MODEL + SET_POINT_MODEL
+    starts = context.proposals.list_alone(len(effects_at_joint))
     if not starts:
         return search.base_model
     fitted, best = list[FittedModel](), search.base_model

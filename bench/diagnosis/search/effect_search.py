@@ -383,7 +383,7 @@ class EffectSearch(ScoredModelSet):
             theta = model.fit.theta.copy()
             remaining_effects = tuple(n for n in model.effects if n != name)
             for richer_law in remaining_effects:
-                contained_slices = self._find_contained_slices(richer_law)
+                contained_slices = self.find_contained_slices(richer_law)
                 if name in contained_slices:
                     theta[contained_slices[name]] += theta[self.evaluator.coefficient_slices[name]]
             theta[self.evaluator.coefficient_slices[name]] = 0.0
@@ -463,10 +463,10 @@ class EffectSearch(ScoredModelSet):
             model: fitted model: its effects, parameters, initial states and likelihood.
             name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         """
-        slices = self._find_contained_slices(name)
+        slices = self.find_contained_slices(name)
         return {law: model.fit.theta[indices] for law, indices in slices.items()}
 
-    def _find_contained_slices(self, name: str) -> dict[str, slice]:
+    def find_contained_slices(self, name: str) -> dict[str, slice]:
         """Return the simpler laws that an effect contains, with the places of their coefficients.
 
         For example, Stribeck friction contains Coulomb friction. The scaling coefficients of the
@@ -477,7 +477,7 @@ class EffectSearch(ScoredModelSet):
             name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
 
         Returns:
-            For each law, where its coefficients are in theta as those of this effect.
+            For each law, the slice of theta with its coefficients within those of this effect.
         """
         effects = self.evaluator.available_effects
         slices = dict[str, slice]()

@@ -34,7 +34,7 @@ class ModelFileReader:
 
     Attributes:
         path: the model file; included files are relative to its folder.
-        description: file that states additions to the model, for messages; None if there is none.
+        description: file that states additions to the model, for messages; None without one.
         places: file and line of each element.
         included: the model file and all included files.
         size: total size of these files in bytes.
