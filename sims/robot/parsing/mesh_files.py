@@ -18,6 +18,8 @@ from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader
 
 MESH_SUFFIXES = (".stl", ".obj", ".msh")
 """File name suffixes of mesh formats that MuJoCo reads."""
+WATER_DENSITY = 1000.0
+"""Density of a sphere that stands for a missing mesh of known mass, kg/m^3 (MuJoCo's default)."""
 MAX_PARENT_FOLDERS = 6
 """Maximum number of parent folders of the model file in which a package is searched."""
 
@@ -123,17 +125,20 @@ class OmittedShapes:
         source: beginning of error messages.
         colliding: files or names of omitted shapes that could have touched others, by reason.
         visual: files or names of omitted elements that are only visual, by reason.
+        replaced: bodies with a shape of known mass that was replaced by a sphere, by reason.
     """
 
     source: str
     colliding: dict[str, list[str]] = field(default_factory=dict)
     visual: dict[str, list[str]] = field(default_factory=dict)
+    replaced: dict[str, list[str]] = field(default_factory=dict)
 
     def leave_out(self, spec: Any, geom: Any, label: str, reason: str) -> None:
         """Remove a geom (shape) whose file cannot be used, and record it for a note to the user.
 
         Shapes that could have touched others are recorded in `colliding`, those that are only
-        visual in `visual`.
+        visual in `visual`. A shape with a stated mass that counts for its body is replaced by a
+        sphere with this mass and the density of water about the origin of the shape.
 
         Args:
             spec: editable model (`mujoco.MjSpec`); it is changed in place.
@@ -146,6 +151,10 @@ class OmittedShapes:
         """
         body = geom.parent
         if determines_mass(spec, geom, body):
+            if np.isfinite(geom.mass):
+                _replace_by_sphere(geom)
+                self.replaced.setdefault(reason, []).append(f"{body.name} {geom.mass:g} kg")
+                return
             raise InputError(
                 f"{self.source}: mesh {truncate_text(label)} {reason}, and the mass of body "
                 f"{truncate_text(body.name)} would follow from it; "
@@ -167,7 +176,23 @@ class OmittedShapes:
             notes.append(
                 f"visual elements left out, since the file {reason}: {format_name_list(labels)}"
             )
+        for reason, labels in self.replaced.items():
+            notes.append(
+                f"shapes replaced by spheres of their stated mass, since their file {reason}: "
+                f"{format_name_list(labels)}; state <inertial> to place the mass exactly"
+            )
         return notes
+
+
+def _replace_by_sphere(geom: Any) -> None:
+    """Replace a mesh by a sphere of the same mass and the density of water, without contacts."""
+    import mujoco
+
+    radius = (3.0 * geom.mass / (4.0 * np.pi * WATER_DENSITY)) ** (1.0 / 3.0)
+    geom.type = mujoco.mjtGeom.mjGEOM_SPHERE
+    geom.meshname = ""
+    geom.size = [radius, 0.0, 0.0]
+    geom.contype = geom.conaffinity = 0
 
 
 def determines_mass(spec: Any, geom: Any, body: Any) -> bool:
@@ -203,7 +228,8 @@ def determines_mass(spec: Any, geom: Any, body: Any) -> bool:
 def is_moving_body(body: Any) -> bool:
     """Return whether a body of a spec moves, by its own joints or those of its ancestors."""
     while body is not None and body.name != "world":
-        if body.joints:
+        # The list `body.joints` cannot be read after a failed compilation if it is empty.
+        if body.first_joint() is not None:
             return True
         body = body.parent
     return False

@@ -43,6 +43,23 @@ def test_absent_meshes_are_left_out_where_masses_are_stated(write, text, note, m
     assert robot.bodies[0].mass == pytest.approx(mass, abs=1e-5)
 
 
+def test_an_absent_mesh_of_stated_mass_is_replaced_by_a_sphere(write):
+    part = '<body name="c" pos="0 0 3"><geom type="mesh" mesh="m" mass="0.5" pos="0 0 1"/></body>'
+    text = mjcf(MESH, INERTIAL, 'size="0.1" mass="0"').replace("</body>", part + "</body>")
+    robot = read_robot(write(text))
+    assert robot.notes == (
+        "shapes replaced by spheres of their stated mass, since their file is absent: c 0.5 kg; "
+        "state <inertial> to place the mass exactly",
+        NO_ACTUATORS_NOTE,
+    )
+    model = robot.compiled
+    assert model.body("c").mass == pytest.approx(0.5)
+    assert model.body("c").ipos == pytest.approx([0, 0, 1])
+    # A sphere of 0.5 kg and 1000 kg/m^3 has a radius of 49.2 mm and the inertia 2/5 m r^2.
+    assert model.body("c").inertia == pytest.approx([4.849e-4] * 3, rel=1e-3)
+    assert model.geom_contype[model.geom_bodyid == model.body("c").id] == 0
+
+
 def test_absent_pictures_and_height_fields_are_left_out(write):
     assets = (
         '<texture name="t" type="2d" file="t.png"/><texture name="s" type="skybox" file="s.png"/>'
