@@ -11,6 +11,11 @@ original growth is ν λ.
     λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        if F' < F, and the step is accepted            (2)
     λ ← 2ν λ,                        ν ← 2ν       otherwise                                      (3)
 
+The cost of a robot is rough, and a step may be wrong at one joint of one run only, such as a joint
+with a stiff servo, whose first velocity the samples hardly show. Each initial state therefore has
+its own damping, which follows the squared residual of the channels of its joint by the same rule.
+If only initial states are fitted, each run takes its own steps, since no run influences another.
+
 Expensive derivatives J may be used for several steps. They are updated with the unpredicted part of
 the change by a step δ, along the step only; D are the scales of the unknowns (C. G. Broyden, Math.
 Comp. 19, 577, 1965, doi:10.1090/S0025-5718-1965-0198670-6; for this method: K. Madsen, H. B.
@@ -78,6 +83,10 @@ INITIAL_DAMPING_GROWTH = 2.0
 """Initial growth factor ν of (3), and the factor by which ν itself grows."""
 MIN_DAMPING_FACTOR = 0.1
 """Minimum factor of (2) by which the damping changes after an accepted step."""
+MAX_LOSS_SHARE = 0.75
+"""Maximum difference of a predicted and an actual decrease of a squared residual, as a share of the
+predicted one, at which the damping of a state does not grow.
+"""
 JACOBIAN_REUSE_TOLERANCE = 0.5
 """Maximum deviation of ρ from 1 at which derivatives are used for another step."""
 
@@ -217,9 +226,14 @@ class FitState:
         high: (q,) upper bounds of the fitted parameters.
         widths: (q,) widths of the plausible ranges of the parameters.
         steps: (q + s,) step sizes of finite differences.
-        damping: λ.
-        growth: ν.
+        channels_of_states: (C, s) mask of the channels whose residuals show each state.
+        state_damping: (R, s) λ of the initial states if the cost is rough; otherwise they have that
+            of the parameters.
+        state_growth: (R, s) ν of the initial states.
+        damping: λ of the parameters.
+        growth: ν of the parameters.
         predicted_decrease: predicted decrease of the cost by the last step.
+        predicted_decreases: (R, C) predicted decrease of the squared residual of each channel.
         is_finished: whether the fit has converged or was eliminated.
         has_own_jacobian: whether the derivatives were computed at the present point, and not at
             another one.
@@ -243,6 +257,10 @@ class FitState:
     high: Array
     widths: Array
     steps: Array
+    channels_of_states: Mask
+    state_damping: Array
+    state_growth: Array
+    predicted_decreases: Array
     damping: float = INITIAL_DAMPING
     growth: float = INITIAL_DAMPING_GROWTH
     predicted_decrease: float = np.inf
@@ -433,6 +451,31 @@ class FitState:
         # With derivatives of the present point the fit has converged; with others it may have.
         if decrease < self.get_tolerance(cost):
             self.mark_converged()
+
+    def adapt_state_damping(self, decreases: Array, is_moved: Mask) -> None:
+        """Update the damping of each initial state of a robot after a step.
+
+        It increases, eq. (3), if the squared residual of the channels of the state decreased far
+        less than predicted. Otherwise it follows its gain ratio, eq. (2), if the run takes the
+        step.
+
+        Args:
+            decreases: (R, C) decrease of the squared residual of each channel by the step.
+            is_moved: (R,) mask of the runs that take the step.
+        """
+        predicted = self.predicted_decreases @ self.channels_of_states
+        actual = decreases @ self.channels_of_states
+        # A simulation that was abandoned has no decrease.
+        is_bad = ~(predicted - actual <= MAX_LOSS_SHARE * np.abs(predicted) + CONVERGENCE_TOLERANCE)
+        gain_ratios = np.clip(actual / np.maximum(predicted, 1e-300), 0.0, 1.0)
+        factors = np.maximum(MIN_DAMPING_FACTOR, 1.0 - (2.0 * gain_ratios - 1.0) ** 3)
+        is_reduced = (predicted > 0.0) & is_moved[:, None]
+        reduced = np.where(is_reduced, self.state_damping * factors, self.state_damping)
+        grown = INITIAL_DAMPING_GROWTH * self.state_growth
+        self.state_damping = np.where(
+            is_bad, self.state_damping * grown, np.maximum(reduced, MIN_DAMPING)
+        )
+        self.state_growth = np.where(is_bad, grown, INITIAL_DAMPING_GROWTH)
 
     def reject_step(self) -> None:
         """React to a step that did not decrease the cost.

@@ -13,9 +13,10 @@ B_i + π⁻²:
     U δx + Σ_i W_i δz_i = a,          a = Σ A_iᵀ r_i                                             (2)
     W_iᵀ δx + V_i δz_i = b_i,         b_i = B_iᵀ r_i - d_i / π                                   (3)
 
-Levenberg-Marquardt damping adds λ times their own diagonals to U and V_i (J. Nocedal, S. J. Wright,
-Numerical Optimization, 2nd ed., section 10.3). Initial states are eliminated run by run. This
-leaves the Schur complement for the shared parameters, from which the initial states follow:
+Levenberg-Marquardt damping adds λ times the diagonal of U to U, and for each initial state its own
+λ times the diagonal of V_i to V_i (J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed.,
+section 10.3). Initial states are eliminated run by run. This leaves the Schur complement for the
+shared parameters, from which the initial states follow:
 
     (U - Σ W_i V_i⁻¹ W_iᵀ) δx = a - Σ W_i V_i⁻¹ b_i                                              (4)
     δz_i = V_i⁻¹ b_i - V_i⁻¹ W_iᵀ δx                                                             (5)
@@ -53,11 +54,13 @@ class GaussNewtonStep:
         parameter_step: (q,) step of the shared parameters.
         state_steps: (R, s) step of the initial states.
         predicted_decrease: predicted decrease of the cost.
+        predicted_decreases: (R, C) predicted decrease of the squared residual of each channel.
     """
 
     parameter_step: Array
     state_steps: Array
     predicted_decrease: float
+    predicted_decreases: Array
 
 
 @dataclass(frozen=True)
@@ -175,6 +178,7 @@ def compute_gauss_newton_step(
     prior: Array,
     known_mask: Mask,
     damping: float,
+    state_damping: Array,
     blocked_mask: Mask,
 ) -> GaussNewtonStep:
     """Compute one damped Gauss-Newton step of parameters and initial states.
@@ -192,7 +196,8 @@ def compute_gauss_newton_step(
         drift: (R, s) deviations d of the initial states from their guesses, in units of the prior.
         prior: (s,) standard deviation π of each initial state about its guess, eq. (1).
         known_mask: (R, s) mask of initial states that do not move, because they are known.
-        damping: Levenberg-Marquardt damping λ.
+        damping: Levenberg-Marquardt damping λ of the parameters.
+        state_damping: (R, s) damping of each initial state.
         blocked_mask: (q,) mask of parameters that do not move, because they are at a bound.
     """
     runs, size = len(residual), jacobian.shape[3]
@@ -202,15 +207,16 @@ def compute_gauss_newton_step(
     equations = _apply_damping(
         _assemble_normal_equations(run_jacobians, run_residuals, q, drift, prior),
         damping,
+        state_damping,
         known_mask,
     )
     # 2. Solution.
     parameter_step, state_steps = equations.solve(blocked_mask)
-    return GaussNewtonStep(
-        parameter_step,
-        state_steps,
-        _predict_decrease(run_jacobians, run_residuals, drift, prior, parameter_step, state_steps),
-    )
+    # 3. Decrease.
+    decreases = _predict_decreases(residual, jacobian, parameter_step, state_steps)
+    remaining_drift = drift + state_steps / prior
+    predicted_decrease = decreases.sum() + (drift**2 - remaining_drift**2).sum()  # (6)
+    return GaussNewtonStep(parameter_step, state_steps, float(predicted_decrease), decreases)
 
 
 def _assemble_normal_equations(
@@ -252,22 +258,24 @@ def _assemble_normal_equations(
 
 
 def _apply_damping(
-    equations: _ArrowheadEquations, damping: float, known_mask: Mask
+    equations: _ArrowheadEquations, damping: float, state_damping: Array, known_mask: Mask
 ) -> _ArrowheadEquations:
     """Add the damping to the normal equations, and hold known initial states fixed.
 
-    The damping λ adds λ times their own diagonals to U and V. A small ridge is always added to U,
-    so that it can be inverted if two parameters have the same response.
+    A small ridge is always added to U, so that it can be inverted if two parameters have the same
+    response.
 
     Shapes: R runs, s states of a run.
 
     Args:
         equations: normal equations with the blocks U of the parameters and V of the initial states.
-        damping: damping λ, without unit.
+        damping: damping λ of the parameters, without unit; it is multiplied by the diagonal of U.
+        state_damping: (R, s) damping of each initial state, for the diagonal of V.
         known_mask: (R, s) mask of the known initial states.
     """
     diagonal = np.einsum("rii->ri", equations.inner)
-    inner = equations.inner + damping * diagonal[:, :, None] * np.eye(equations.inner.shape[1])
+    added = state_damping * diagonal
+    inner = equations.inner + added[:, :, None] * np.eye(equations.inner.shape[1])
     inner, cross = hold_known_states(inner, equations.cross, known_mask)
     pull = np.where(known_mask, 0.0, equations.pull)
 
@@ -276,44 +284,28 @@ def _apply_damping(
     return _ArrowheadEquations(shared, cross, inner, equations.gradient, pull)
 
 
-def _predict_decrease(
-    jacobian: Array,
-    residual: Array,
-    drift: Array,
-    prior: Array,
-    parameter_step: Array,
-    state_steps: Array,
-) -> float:
-    """Return by how much a step would decrease the cost if the residual were linear, eq. (6).
+def _predict_decreases(
+    residual: Array, jacobian: Array, parameter_step: Array, state_steps: Array
+) -> Array:
+    """Return by how much a step would decrease the squared residuals (R, C) if they were linear.
 
-    The damping is adapted to how well the actual decrease agrees with it. It is
+    Their sum is the first part of eq. (6): for run i, |r_i|^2 - |r_i - A_i dx - B_i dz_i|^2 with
+    the derivatives A_i by the parameters and B_i by the initial state. The damping is adapted to
+    how well the actual decreases agree with them.
 
-        sum_i |r_i|^2 - |r_i - A_i dx - B_i dz_i|^2 + sum_i |d_i|^2 - |d_i + dz_i / pi|^2,
-
-    with the residual r_i of run i, its derivatives A_i by the parameters and B_i by the initial
-    state, the steps dx and dz_i, and the deviation d_i of the initial state in units of the prior
-    pi.
-
-    Shapes: R runs, q fitted parameters, s states of a run.
+    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
 
     Args:
-        jacobian: (R, n, q + s) whitened derivatives, those by initial states last; n samples.
-        residual: (R, n) whitened residuals.
-        drift: (R, s) deviations d of the initial states from their guesses, eq. (1).
-        prior: (s,) standard deviation π of each initial state about its guess, eq. (1).
-        parameter_step: (q,) step of the shared parameters.
-        state_steps: (R, s) steps of the initial states.
+        residual: (R, T, C) whitened residuals r.
+        jacobian: (R, T, C, q + s) whitened derivatives, those by initial states last.
+        parameter_step: (q,) step dx of the shared parameters.
+        state_steps: (R, s) steps dz of the initial states.
     """
     repeated = np.tile(parameter_step, (len(residual), 1))
     steps = np.concatenate([repeated, state_steps], axis=1)
-    changes = np.matmul(jacobian, steps[:, :, None])[:, :, 0]
-    remaining_residual = residual - changes
-    remaining_drift = drift + state_steps / prior
-    predicted_decrease = float(
-        (residual * residual).sum() - (remaining_residual * remaining_residual).sum()
-    )
-    predicted_decrease += float((drift**2).sum() - (remaining_drift**2).sum())
-    return predicted_decrease
+    remaining = residual - np.matmul(jacobian, steps[:, None, :, None])[..., 0]
+    decreases: Array = (residual**2 - remaining**2).sum(axis=1)
+    return decreases
 
 
 TARGET_RESPONSE_SIGMAS = 0.1

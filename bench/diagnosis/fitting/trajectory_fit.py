@@ -18,6 +18,8 @@ from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, whiten
 from bench.diagnosis.evaluation.parameter_bounds import Bounds, get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import MIN_CHUNK_SIZE, Indices, RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt_state import (
+    INITIAL_DAMPING,
+    INITIAL_DAMPING_GROWTH,
     MAX_DAMPING,
     FitPoint,
     FitStart,
@@ -304,7 +306,7 @@ class TrajectoryFitter:
                 else self._simulate_points
             )
             for (fit_state, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
-                self._accept_or_reject_trial(fit_state, point)
+                self._accept_or_reject_trial(fit_state, point, sample_mask)
         return list(fit_states)
 
     def _simulate_starts(self, fit_states: Sequence[FitState], sample_mask: Mask) -> None:
@@ -469,6 +471,10 @@ class TrajectoryFitter:
             high=high,
             widths=widths,
             steps=np.concatenate([INITIAL_PARAMETER_STEP * widths, state_steps]),
+            channels_of_states=_find_channels_of_states(evaluator),
+            state_damping=np.full(start.initial_states.shape, INITIAL_DAMPING),
+            state_growth=np.full(start.initial_states.shape, INITIAL_DAMPING_GROWTH),
+            predicted_decreases=np.zeros((len(start.initial_states), len(evaluator.channels))),
             is_final_fit=self.is_final_fit,
             has_rough_cost=evaluator.has_linearisation,
             sample_count=int(evaluator.get_sample_mask(self.share).sum()),
@@ -682,13 +688,27 @@ class TrajectoryFitter:
         It is infinite for a run whose simulation was abandoned.
         """
         deviation = self._compute_state_deviation(states)
+        squares = self._compute_squares(simulated, sample_mask).sum(axis=1)
         with np.errstate(all="ignore"):
-            residual = self._compute_residual(simulated, sample_mask)
-            whitened = whiten(residual, sample_mask, self.noise)
-            squares = np.square(whitened).sum(axis=(1, 2)) + np.square(deviation).sum(axis=1)
+            squares += np.square(deviation).sum(axis=1)
         # An abandoned batch element is NaN, which cannot be compared.
         costs: Array = np.where(np.isfinite(squares), squares, np.inf)
         return costs
+
+    def _compute_squares(self, simulated: Array, sample_mask: Mask) -> Array:
+        """Return the squared whitened residual (R, C) of each channel of each run.
+
+        It is NaN or infinite where a simulation was abandoned.
+
+        Args:
+            simulated: (R, T, C) simulated runs.
+            sample_mask: (R, T, C) mask of the samples that count.
+        """
+        with np.errstate(all="ignore"):
+            residual = self._compute_residual(simulated, sample_mask)
+            whitened = whiten(residual, sample_mask, self.noise)
+            squares: Array = np.square(whitened).sum(axis=1)
+        return squares
 
     def _propose_trials(
         self, fit_states: Sequence[FitState], sample_mask: Mask
@@ -740,10 +760,16 @@ class TrajectoryFitter:
             prior=compute_state_prior(self.evaluator),
             known_mask=self.evaluator.known_state_mask,
             damping=fit_state.damping,
+            state_damping=(
+                fit_state.state_damping
+                if fit_state.has_rough_cost
+                else np.full_like(fit_state.state_damping, fit_state.damping)
+            ),
             # Clipping these parameters after the step would distort it.
             blocked_mask=fit_state.find_blocked_parameters(residual, jacobian),
         )
         fit_state.predicted_decrease = step.predicted_decrease
+        fit_state.predicted_decreases = step.predicted_decreases
         # The fit has converged, no step is short enough, or numbers overflow.
         if (
             not np.isfinite(step.predicted_decrease)
@@ -761,20 +787,29 @@ class TrajectoryFitter:
             point.start, theta=theta, initial_states=point.start.initial_states + step.state_steps
         )
 
-    def _accept_or_reject_trial(self, fit_state: FitState, point: FitPoint) -> None:
+    def _accept_or_reject_trial(
+        self, fit_state: FitState, point: FitPoint, sample_mask: Mask
+    ) -> None:
         """Accept a trial point if its cost is lower, else reject it, and update the damping.
 
-        If the trial was simulated without derivatives, Broyden's method updates those of the last
-        point.
+        If only initial states of a robot are fitted, the trial is accepted in the runs whose cost
+        is lower. If the trial was simulated without derivatives, Broyden's method updates those of
+        the last point.
 
         Args:
             fit_state: state of the fit, changed in place.
             point: the simulated trial point.
+            sample_mask: (R, T, C) samples that count in the cost.
         """
+        is_blocked = False
+        if fit_state.has_rough_cost:
+            point, is_blocked = self._judge_runs(fit_state, point, sample_mask)
         decrease = fit_state.point.cost - point.cost
+        # A small gain of some runs is no sign of convergence while the steps of others fail.
+        is_accepted = decrease > (fit_state.get_tolerance(point.cost) if is_blocked else 0.0)
         # Whether the step was computed with derivatives of the point where it began.
         is_own_jacobian = fit_state.has_own_jacobian
-        if point.cost < fit_state.point.cost:
+        if is_accepted:
             if self._updates_derivatives:
                 fit_state.point = replace(point, jacobian=fit_state.update_jacobian(point))
                 # Updated derivatives are approximate. Those of a robot by initial states, from a
@@ -786,6 +821,79 @@ class TrajectoryFitter:
             fit_state.accept_step(decrease, point.cost, is_own_jacobian)
         else:
             fit_state.reject_step()
+
+    def _judge_runs(
+        self, fit_state: FitState, trial: FitPoint, sample_mask: Mask
+    ) -> tuple[FitPoint, bool]:
+        """Update the damping of the initial states of a robot by what a trial gained in each run.
+
+        Args:
+            fit_state: state of the fit, changed in place.
+            trial: the simulated trial point.
+            sample_mask: (R, T, C) samples that count in the cost.
+
+        Returns:
+            The trial point. If only initial states are fitted, it has the trial states in the runs
+            whose cost is lower, and the present ones in the others; the second value tells whether
+            there are others.
+        """
+        last = fit_state.point
+        last_costs, costs = (
+            self._compute_run_costs(p.simulated, p.start.initial_states, sample_mask)
+            for p in (last, trial)
+        )
+        has_parameters = fit_state.free_indices.size > 0
+        is_moved = (
+            np.full(len(costs), trial.cost < last.cost) if has_parameters else costs < last_costs
+        )
+        with np.errstate(all="ignore"):
+            decreases = self._compute_squares(last.simulated, sample_mask)
+            decreases -= self._compute_squares(trial.simulated, sample_mask)
+        fit_state.adapt_state_damping(decreases, is_moved)
+        if has_parameters:
+            return trial, False
+        combined = _combine_runs(last, trial, is_moved, np.minimum(costs, last_costs))
+        return combined, bool((costs > last_costs).any())
+
+
+def _find_channels_of_states(evaluator: RunEvaluator) -> Mask:
+    """Return the channels whose residuals show each initial state best, as a mask (C, s).
+
+    These are the position and the velocity of the same joint, or all channels if neither is
+    recorded.
+
+    Shapes: C channels, s states of a run.
+
+    Args:
+        evaluator: the runs.
+    """
+    joints_of_channels, joints_of_states = (
+        np.array([name.partition(".")[2] for name in names])
+        for names in (evaluator.channels, evaluator.state_names)
+    )
+    is_of_joint = np.array([name.startswith(("q.", "qd.")) for name in evaluator.channels])
+    shows: Mask = (joints_of_channels[:, None] == joints_of_states) & is_of_joint[:, None]
+    return shows | ~shows.any(axis=0)
+
+
+def _combine_runs(last: FitPoint, trial: FitPoint, is_moved: Mask, costs: Array) -> FitPoint:
+    """Return the trial point in some runs, and the last point in the others.
+
+    Both points have the same parameters, so that no run influences another one.
+
+    Args:
+        last: the point before the step.
+        trial: the point after the step.
+        is_moved: (R,) mask of the runs of the trial point.
+        costs: (R,) costs of the combined runs.
+    """
+    states = np.where(is_moved[:, None], trial.start.initial_states, last.start.initial_states)
+    return replace(
+        trial,
+        start=replace(trial.start, initial_states=states),
+        simulated=np.where(is_moved[:, None, None], trial.simulated, last.simulated),
+        cost=float(costs.sum()),
+    )
 
 
 def _can_stick(evaluator: RunEvaluator, names: Sequence[str]) -> bool:

@@ -7,6 +7,8 @@ import pytest
 
 from bench.diagnosis.evaluation.discretisation_error import MAX_CORRECTED_ERROR, StepRefinement
 from bench.diagnosis.fitting.levenberg_marquardt_state import (
+    INITIAL_DAMPING,
+    INITIAL_DAMPING_GROWTH,
     FitPoint,
     FitStart,
     FitState,
@@ -35,7 +37,13 @@ def problem(jacobian, steps=None):
     zero = at(np.zeros(SHARED), np.zeros((RUNS, STATES)), jacobian)
     steps = np.ones(SHARED + STATES) if steps is None else steps
     bounds = -np.ones(SHARED), np.ones(SHARED), 2 * np.ones(SHARED)
-    return FitState(zero, np.arange(SHARED), *bounds, steps)
+    damping = np.full((RUNS, STATES), INITIAL_DAMPING)
+    growth = np.full((RUNS, STATES), INITIAL_DAMPING_GROWTH)
+    predicted = np.zeros((RUNS, CHANNELS))
+    return FitState(
+        zero, np.arange(SHARED), *bounds, steps, np.eye(CHANNELS, STATES, dtype=bool),
+        damping, growth, predicted,
+    )  # fmt: skip
 
 
 def moved(theta, states):
@@ -142,3 +150,22 @@ def test_a_rough_fit_ends_at_gains_that_its_own_derivatives_do_not_predict(
     state.has_rough_cost, state.is_final_fit, state.predicted_decrease = rough, True, 0.3
     state.accept_step(decrease, 1000.0, is_own_jacobian=True)
     assert state.is_finished == is_finished
+
+
+def test_only_the_states_of_a_joint_that_a_step_gets_wrong_are_damped():
+    """The first state is shown by the first channel, the second by the second one."""
+    state = problem(TRUE)
+    state.has_rough_cost = True
+    state.predicted_decreases = np.array([[10.0, 10.0], [10.0, 10.0]])
+    decreases = np.array([[9.0, -50.0], [9.0, 1.0]])
+    state.adapt_state_damping(decreases, np.array([False, True]))
+    # Eq. (3) where a step loses or gains far too little, (2) where the run moves, else as before.
+    np.testing.assert_allclose(
+        state.state_damping / INITIAL_DAMPING, [[1.0, 4.0], [1 - 0.8**3, 4.0]]
+    )
+    state.predicted_decreases = np.array([[-5.0, 10.0], [0.0, 10.0]])
+    state.adapt_state_damping(np.array([[-6.0, -50.0], [0.0, 10.0]]), np.array([True, True]))
+    # A loss as predicted changes nothing; the second failure in a row doubles the growth.
+    np.testing.assert_allclose(
+        state.state_damping / INITIAL_DAMPING, [[1.0, 32.0], [1 - 0.8**3, 0.4]]
+    )
