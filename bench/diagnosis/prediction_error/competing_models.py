@@ -157,9 +157,9 @@ def replace_by_richer_laws(context: SearchContext, best: FittedModel) -> FittedM
     """Return a model with a richer law in place of one of its laws, if that is likelier.
 
     Friction that depends on the position or the velocity looks like Coulomb friction at first, and
-    a selection that begins with the latter may not reach the richer law. The richer laws contain
-    the law, at the same place. Those with the largest gains by the regression about the model are
-    fitted, each with its best shape.
+    a selection that begins with the latter may not reach the richer law. A heavier body looks like
+    a payload anywhere on it. Those richer laws with the largest gains by the regression about the
+    model are fitted, each with its best shape.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -169,9 +169,7 @@ def replace_by_richer_laws(context: SearchContext, best: FittedModel) -> FittedM
     if not best.effects or not np.isfinite(best.fit.cost) or has_series(evaluator, best.effects):
         return best
     for name in best.effects:
-        richer_laws = [
-            law for law in evaluator.library if name in search.find_contained_slices(law)
-        ]
+        richer_laws = _list_richer_laws(context, name)
         if not richer_laws:
             continue
         regression, own_columns = context.columns.regression(best)
@@ -181,6 +179,22 @@ def replace_by_richer_laws(context: SearchContext, best: FittedModel) -> FittedM
             coefficients = context.columns.solve_alone(remaining, group)
             starts.append(make_replacing_start(evaluator, best, [name], group.effect, coefficients))
     return _select_improved(context, best, search.fit_all(starts)) if starts else best
+
+
+def _list_richer_laws(context: SearchContext, name: str) -> list[str]:
+    """Return the laws at the same place that contain an effect, and the payload of a mass.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        name: name of the effect.
+    """
+    effect, _, place = name.partition("@")
+    return [
+        law
+        for law in context.evaluator.library
+        if name in context.search.find_contained_slices(law)
+        or (effect == "mass.scale" and law == f"payload@{place}")
+    ]
 
 
 def _select_improved(

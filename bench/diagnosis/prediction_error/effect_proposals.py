@@ -42,6 +42,7 @@ from bench.diagnosis.prediction_error.regression_columns import (
     LibraryColumns,
     build_regression_about,
 )
+from bench.diagnosis.prediction_error.regression_selection import Regression
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.fit_starts import add_effect_to_start
 from sims.core.simulator import Array
@@ -59,6 +60,8 @@ If much process noise hides the differences, those with many coefficients gain m
 """
 MAX_JOINT_PROPOSALS = 3
 """Maximum number of effects of the joint and servo models that are added to a set."""
+MAX_MASS_PROPOSALS = 4
+"""Maximum number of masses among the proposals of a robot whose joints may stick."""
 MIN_GAIN_SHARE = 0.3
 """Minimum gain by regression of a proposed effect, as a share of the largest gain."""
 COMMAND_MODEL = ("input.lag@*",)
@@ -80,8 +83,9 @@ class ProposedEffects(NamedTuple):
 
     Attributes:
         by_regression: the effects with the largest gains by regression.
-        only_simulated: those with the next largest gains, and the delays and lags that may replace
-            one of `by_regression`. They are simulated, but neither fitted nor filtered.
+        only_simulated: those with the next largest gains, the delays and lags that may replace one
+            of `by_regression`, and masses of a robot whose joints may stick. They are simulated,
+            but neither fitted nor filtered.
         offset_and_friction: an encoder offset, and less dry friction.
         joint_model: effects of the standard joint and servo models, the most useful first.
     """
@@ -171,7 +175,8 @@ class EffectProposals:
             current: the set, with its filter. Effects of the joint and servo models are proposed at
                 the joint where this filter misses most.
         """
-        ranked = list(self._propose_by_regression(current).items())
+        regression = self._regress(current)
+        ranked = list(self._propose_by_regression(regression, current.names).items())
         by_regression = dict(ranked[:MAX_REGRESSION_PROPOSALS])
         # A filter does not follow late readings, so that the regression misjudges them.
         similar_shifts = {
@@ -180,6 +185,7 @@ class EffectProposals:
             for similar in list_similar_shifts(self.filters.evaluator, name)
         }
         only_simulated = dict(ranked[MAX_REGRESSION_PROPOSALS:]) | similar_shifts
+        only_simulated |= self._propose_masses(regression)
         excluded = {*current.names, *by_regression}
         joint = current.followed.joints_by_loss[0]
         return ProposedEffects(
@@ -189,27 +195,39 @@ class EffectProposals:
             self._propose_joint_model(current.followed, joint, excluded),
         )
 
-    def _propose_by_regression(self, current: FilteredSet) -> Proposals:
+    def _regress(self, current: FilteredSet) -> Regression:
+        """Return the regression of the innovations of a set on the responses to each effect.
+
+        Innovations are the one-step prediction errors of the filter with the set.
+
+        Args:
+            current: the set, with its filter; no effects mean the base model.
+        """
+        if not current.names:
+            return self.columns.base_regression
+        regression, _ = build_regression_about(current, [self.columns.library], current.followed)
+        return regression
+
+    def _propose_by_regression(
+        self, regression: Regression, present_names: Collection[str]
+    ) -> Proposals:
         """Propose the effects with the largest net gain by regression, with their coefficients.
 
-        The innovations (one-step prediction errors) of the filter with the set `current` are
-        regressed on the responses to each effect. The net gain is the gain in twice the
-        log-likelihood minus the penalty of the effect. Effects whose gain is a small share of the
-        largest, and all but a few families (effects at every place, ``@*``), are left out.
+        The net gain is the gain in twice the log-likelihood minus the penalty of the effect.
+        Effects whose gain is a small share of the largest, and all but a few families (effects at
+        every place, ``@*``), are left out.
+
+        Args:
+            regression: regression of innovations on the responses to each effect.
+            present_names: names of effects that the model has already.
         """
-        if current.names:
-            regression, _ = build_regression_about(
-                current, [self.columns.library], current.followed
-            )
-        else:
-            regression = self.columns.base_regression
         gains = regression.compute_net_gains()
         proposals: Proposals = {}
         for i in np.argsort(-gains, kind="stable").tolist():
             group = regression.groups[i]
             families = [name for name in proposals if name.endswith("@*")]
             is_surplus = group.effect.endswith("@*") and len(families) == MAX_FAMILY_PROPOSALS
-            if is_surplus or group.effect in (*current.names, *proposals):
+            if is_surplus or group.effect in (*present_names, *proposals):
                 continue
             # Gains are in descending order, so all further ones are too small, too.
             is_small = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
@@ -217,6 +235,36 @@ class EffectProposals:
                 break
             proposals[group.effect] = self.columns.solve_alone(regression, group)
         return proposals
+
+    def _propose_masses(self, regression: Regression) -> Proposals:
+        """Propose the masses of single bodies with the largest gains, if joints may stick.
+
+        Dry friction bears a part of the load of a joint that rests or creeps. Beyond the limit of
+        the friction, the joint moves far more than the linear response to a small mass shows, so
+        that the regression underestimates the gain of a large one.
+
+        Args:
+            regression: regression of innovations on the responses to each effect.
+
+        Returns:
+            Names and coefficients; none for a robot without dry friction.
+        """
+        simulator = self.filters.evaluator.simulator
+        assert isinstance(simulator, RobotSimulator)
+        if not simulator.robot.compiled.dof_frictionloss.any():
+            return {}
+        groups, gains = regression.groups, regression.compute_net_gains()
+        masses = [
+            i
+            for i in np.argsort(-gains, kind="stable").tolist()
+            if groups[i].effect.startswith("mass.scale@")
+            and not groups[i].effect.endswith("@*")
+            and gains[i] > 0.0
+        ]
+        return {
+            groups[i].effect: self.columns.solve_alone(regression, groups[i])
+            for i in masses[:MAX_MASS_PROPOSALS]
+        }
 
     def _propose_offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
         """Propose an encoder offset at a joint, and less dry friction than in the model file.

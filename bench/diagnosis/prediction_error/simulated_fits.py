@@ -29,6 +29,8 @@ from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
 NEARBY_FACTORS = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
 """Factors of a coefficient at which a fit looks for a lower cost nearby."""
+MAX_NEARBY_SIZE = 3
+"""Maximum number of coefficients of an effect that is fitted again from nearby ones."""
 EXPLAINED_EXCESS = 0.03
 """Maximum excess over the noise of a fitted set that explains the data; see `is_at_noise`."""
 NEARLY_EXPLAINED_SHARE = 0.1
@@ -78,6 +80,7 @@ def fit_by_simulation(
     3. Fit it again with derivatives by the first states about the simulated motion, because those
        about the measured motion may be invalid.
     4. Fit dry friction again from nearby coefficients, because its fit may stop in a local minimum.
+       Where servos reach their force limits, this is done for all small effects.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -106,8 +109,11 @@ def fit_by_simulation(
     if not is_explained(context, fitted):
         # Derivatives about a wrong motion are not valid for other models.
         evaluator.state_derivatives = derivatives_before
+    has_jumps = bool(context.filters.base.runs.jumps.any())
     for name in fitted.effects:
-        if has_dry_friction(evaluator, [name]) and not is_explained(context, fitted):
+        is_small = len(evaluator.get_coefficient_indices(name)) <= MAX_NEARBY_SIZE
+        may_stop_early = has_dry_friction(evaluator, [name]) or (has_jumps and is_small)
+        if may_stop_early and not is_explained(context, fitted):
             fitted = fit_nearby(context, fitted, name)
     return fitted
 

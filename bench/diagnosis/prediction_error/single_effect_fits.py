@@ -50,6 +50,8 @@ MAX_SINGLE_SQUARES_SHARE = 0.3
 MIN_FAMILY_SQUARES_SHARE = 0.05
 """Minimum share of its squared residual by which an effect at all places beats one of its places.
 """
+MAX_SCANNED = 5
+"""Maximum number of likely effects that are simulated at closer factors, before any fit."""
 MAX_SCANNED_FITS = 2
 """Maximum number of likely effects that are fitted alone."""
 MAX_NEARBY = 5
@@ -155,8 +157,9 @@ def scale_effect(context: SearchContext, start: FitStart, name: str, factor: flo
 def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStart]) -> FittedModel:
     """Fit the effects that alone remove most of the residual, one after another.
 
-    A coefficient far from the linear range is first improved by simulations at factors of it,
-    because the cost has local minima. The fits end with the first model that explains the runs.
+    Coefficients far from the linear range are first improved by simulations at factors of them,
+    because the cost has local minima. The effects with the lowest costs are then fitted; the fits
+    end with the first model that explains the runs.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -166,12 +169,11 @@ def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStar
         The best model, which may be the base model.
     """
     best = context.search.base_model
-    for likely_start in likely_starts[:MAX_SCANNED_FITS]:
-        rated_starts = [likely_start]
-        for factors in CLOSER_FACTORS:
-            if not has_noise_like_cost(context, rated_starts):
-                rated_starts = _try_scaled(context, rated_starts, factors)
-        ((_, start),) = rated_starts
+    scanned = list(likely_starts[:MAX_SCANNED])
+    for factors in CLOSER_FACTORS:
+        if not has_noise_like_cost(context, scanned):
+            scanned = _try_scaled(context, scanned, factors)
+    for _, start in scanned[:MAX_SCANNED_FITS]:
         fitted = fit_by_simulation(context, start)
         if not is_explained(context, fitted) and is_nearly_explained(context, fitted):
             fitted = fit_nearby(context, fitted, fitted.effects[0])
