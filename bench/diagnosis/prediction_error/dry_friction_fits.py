@@ -8,15 +8,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.diagnosis.fitting.base_fit import compute_start_costs
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.friction_form_verdict import (
     has_dry_friction,
+    make_soft_kind,
     refit_if_likelier_soft,
     replace_by_stateless_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import MIN_GAIN_SHARE, SearchContext
-from bench.diagnosis.prediction_error.filters_with_effects import compute_comparison_margin
+from bench.diagnosis.prediction_error.effects_at_joints import get_joint_name
+from bench.diagnosis.prediction_error.filters_with_effects import (
+    compute_comparison_margin,
+    make_soft_friction_models,
+)
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
     drop_surplus_effects,
@@ -39,6 +45,8 @@ MIN_LEAD_SHARE = 0.1
 
 It is a share of the gain over the base model.
 """
+MAX_SOFT_SQUARES_SHARE = 0.3
+"""Maximum share of the squared residual that soft dry friction alone leaves before any fit."""
 
 
 class SoftFrictionError(Exception):
@@ -117,6 +125,48 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
         if is_explained(context, soft_friction) or lead > _compute_margin(context, stiff_friction):
             raise SoftFrictionError(soft_friction.fit.make_start(), is_preliminary=True)
     return None
+
+
+def check_simulated_soft_friction(context: SearchContext) -> None:
+    """Raise `SoftFrictionError` if simulated soft friction of a joint removes most of the residual.
+
+    A regression may miss it, because a joint that creeps under its load responds to the friction of
+    the stiff form as to none. A few forces are simulated at each joint, without a fit, so this is
+    faster than any further search in the stiff form. Nothing is done if the search has the soft
+    form already, or if forces are missing at several joints.
+
+    Args:
+        context: search, filters and regressions of the recording.
+
+    Raises:
+        SoftFrictionError: soft friction leaves at most `MAX_SOFT_SQUARES_SHARE`.
+    """
+    filters, evaluator = context.filters, context.evaluator
+    if filters.is_soft or not filters.base.has_missing_force:
+        return
+    states = filters.estimate_first_states(filters.base)
+    starts = []
+    for joint in range(len(evaluator.simulator.system.coordinates)):
+        name = f"friction.coulomb@{get_joint_name(evaluator, joint)}"
+        if name in evaluator.library and filters.act_where_forces_are_missing([name]):
+            thetas = [
+                theta
+                for sign in (1.0, -1.0)
+                for theta in make_soft_friction_models(filters.base, filters.reference, joint, sign)
+            ]
+            starts += [FitStart((name,), theta, states) for theta in thetas]
+    if not starts:
+        return
+    soft_evaluator = evaluator.with_kind(make_soft_kind(evaluator.kind))
+    try:
+        costs = compute_start_costs(
+            soft_evaluator, context.search.noise, starts, share=1.0, failed_residual=np.inf
+        )
+    finally:
+        soft_evaluator.close()
+    best = int(np.argmin(costs))
+    if costs[best] < MAX_SOFT_SQUARES_SHARE * context.search.base_model.fit.cost:
+        raise SoftFrictionError(starts[best], is_preliminary=True)
 
 
 def _find_soft_friction(context: SearchContext) -> FitStart | None:

@@ -44,6 +44,7 @@ from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
 from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.friction_form_verdict import has_dry_friction
 from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
 from bench.diagnosis.prediction_error.competing_models import (
     fit_competing_models,
@@ -54,6 +55,7 @@ from bench.diagnosis.prediction_error.competing_models import (
 from bench.diagnosis.prediction_error.dry_friction_fits import (
     check_fit,
     check_simple_friction,
+    check_simulated_soft_friction,
     compare_friction_forms,
     fit_dry_friction,
 )
@@ -88,11 +90,13 @@ from bench.diagnosis.prediction_error.settled_simulations import refine_with_wid
 from bench.diagnosis.prediction_error.simulated_fits import (
     RatedStart,
     fit_by_simulation,
+    fit_nearby,
     fit_quick_selection,
     fit_selection,
     is_at_noise,
     is_explained,
     is_nearly_explained,
+    is_slow_to_simulate,
     remove_idle_effects,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
@@ -113,6 +117,8 @@ from sims.core.simulator import Array
 
 MIN_INCOMPLETE_SHARE = 0.6
 """Minimum share of the joints of a real arm whose servo or friction the model lacks."""
+SLOW_TEST_STEPS = 4
+"""Maximum number of steps of the fit that tests an effect that is slow to simulate."""
 TRIED_SHARES = (1.0, 0.5)
 """Shares of the regression coefficients with which a filter must follow the runs better."""
 
@@ -216,7 +222,7 @@ class PredictionErrorSearch(EffectSearch):
         3. identification servo by servo, after which nothing else is done if it succeeds;
         4. dry friction alone, then the set that regression selects, with a lag in place of a delay
            or the reverse, then the set that regressions with dry friction of all joints in the
-           model select;
+           model select, then soft dry friction of one joint;
         5. effects with many shapes, such as forces of any period, then richer laws in place of
            those that leave a residual;
         6. series effects (elastic or slack transmissions) that remove most of the residual;
@@ -263,6 +269,8 @@ class PredictionErrorSearch(EffectSearch):
         if self._should_continue(best) and not has_jumps:
             best = select_likeliest(best, fit_likely_effects(context, self._likely_starts))
         selected_with_shapes = selected
+        if self._should_continue(best) and not self.is_form_given:
+            check_simulated_soft_friction(context)
         if self._should_continue(best):
             selected_with_shapes = context.columns.select_with_shapes(selected)
             best = select_likeliest(best, fit_quick_selection(context, selected_with_shapes))
@@ -423,6 +431,22 @@ class PredictionErrorSearch(EffectSearch):
         start = find_first_states(self.evaluator, self.noise, model.fit)
         return model if start is None else select_likeliest(model, self.fit_one(start))
 
+    def refit_dry_friction(self, model: FittedModel) -> FittedModel:
+        """Fit a model again from nearby dry friction, if that is better.
+
+        The cost jumps where a joint begins to stick for a moment, so that the best friction
+        may lie beyond a jump that is too small to count as an unexplained residual.
+
+        Args:
+            model: the fitted model; it is returned if its simulation fails.
+        """
+        if not np.isfinite(model.fit.cost):
+            return model
+        for name in model.effects:
+            if has_dry_friction(self.evaluator, [name]):
+                model = select_likeliest(model, fit_nearby(self._search_context, model, name))
+        return model
+
     def fit_competing_models(self, best: FittedModel) -> FittedModel:
         """Fit the sets that are nearly as good, and return the best of all."""
         return fit_competing_models(self._search_context, best)
@@ -479,7 +503,7 @@ class PredictionErrorSearch(EffectSearch):
 
         1. linear regression of the innovations, which also chooses the effect;
         2. a filter with the effect in its model, at a few shares of the coefficient;
-        3. a fit by simulation.
+        3. a fit by simulation, of few steps if the effect is slow to simulate.
 
         The p-value of the first test that is not significant is returned, or that of the last one.
 
@@ -508,7 +532,8 @@ class PredictionErrorSearch(EffectSearch):
         p_value_by_filter = compute_p_value_of_gain(max(gains), len(indices), library_size)
         if p_value_by_filter > EFFECT_P_VALUE_THRESHOLD:
             return p_value_by_filter
-        larger = self.fit_one(start)
+        is_slow = is_slow_to_simulate(self._search_context, [name])
+        larger = self.fit_one(start, *([SLOW_TEST_STEPS] if is_slow else []))
         gain = larger.likelihood.value - model.likelihood.value
         return compute_p_value_of_gain(gain, len(indices), library_size)
 

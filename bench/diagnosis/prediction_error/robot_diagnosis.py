@@ -119,7 +119,7 @@ class RobotDiagnosis(Diagnosis):
             self._model = search.fit_competing_models(self._model)
             self._evaluate_on_held_out_runs()
         search_control.begin_question("structure")
-        fitted = search.refit_first_states(self._model)
+        fitted = search.refit_first_states(search.refit_dry_friction(self._model))
         self._model = search.fit_to_convergence(fitted)
         lack_of_fit = assess_lack_of_fit(search, self._model)
         if not lack_of_fit.has_structure:
