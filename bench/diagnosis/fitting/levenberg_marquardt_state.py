@@ -465,9 +465,11 @@ class FitState:
         """
         predicted = self.predicted_decreases @ self.channels_of_states
         actual = decreases @ self.channels_of_states
-        # A simulation that was abandoned has no decrease.
-        is_bad = ~(predicted - actual <= MAX_LOSS_SHARE * np.abs(predicted) + CONVERGENCE_TOLERANCE)
-        gain_ratios = np.clip(actual / np.maximum(predicted, 1e-300), 0.0, 1.0)
+        # A simulation that was abandoned or diverged has no finite decrease.
+        with np.errstate(all="ignore"):
+            loss = predicted - actual
+            is_bad = ~(loss <= MAX_LOSS_SHARE * np.abs(predicted) + CONVERGENCE_TOLERANCE)
+            gain_ratios = np.clip(actual / np.maximum(predicted, 1e-300), 0.0, 1.0)
         factors = np.maximum(MIN_DAMPING_FACTOR, 1.0 - (2.0 * gain_ratios - 1.0) ** 3)
         is_reduced = (predicted > 0.0) & is_moved[:, None]
         reduced = np.where(is_reduced, self.state_damping * factors, self.state_damping)
