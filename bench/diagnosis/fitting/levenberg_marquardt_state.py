@@ -12,9 +12,9 @@ original growth is ν λ.
     λ ← 2ν λ,                        ν ← 2ν       otherwise                                      (3)
 
 The cost of a robot is rough, and a step may be wrong at one joint of one run only, such as a joint
-with a stiff servo, whose first velocity the samples hardly show. Each initial state therefore has
-its own damping, which follows the squared residual of the channels of its joint by the same rule.
-If only initial states are fitted, each run takes its own steps, since no run influences another.
+with a stiff servo, whose first velocity the samples hardly show. If only initial states are fitted,
+each of them has its own damping, which follows the squared residual of the channels of its joint by
+the same rule, and each run takes its own steps, since no run influences another.
 
 Expensive derivatives J may be used for several steps. They are updated with the unpredicted part of
 the change by a step δ, along the step only; D are the scales of the unknowns (C. G. Broyden, Math.
@@ -227,8 +227,8 @@ class FitState:
         widths: (q,) widths of the plausible ranges of the parameters.
         steps: (q + s,) step sizes of finite differences.
         channels_of_states: (C, s) mask of the channels whose residuals show each state.
-        state_damping: (R, s) λ of the initial states if the cost is rough; otherwise they have that
-            of the parameters.
+        state_damping: (R, s) λ of the initial states if `fits_rough_states`; otherwise they have
+            that of the parameters.
         state_growth: (R, s) ν of the initial states.
         damping: λ of the parameters.
         growth: ν of the parameters.
@@ -276,6 +276,11 @@ class FitState:
     own_state_cost: float = np.inf
     can_stick: bool = False
     has_unreliable_states: bool = False
+
+    @property
+    def fits_rough_states(self) -> bool:
+        """True for the fit of a robot's initial states alone."""
+        return self.has_rough_cost and not self.free_indices.size
 
     @property
     def needs_own_state_jacobian(self) -> bool:
@@ -453,7 +458,7 @@ class FitState:
             self.mark_converged()
 
     def adapt_state_damping(self, decreases: Array, is_moved: Mask) -> None:
-        """Update the damping of each initial state of a robot after a step.
+        """Update the damping of each initial state after a step of initial states alone.
 
         It increases, eq. (3), if the squared residual of the channels of the state decreased far
         less than predicted. Otherwise it follows its gain ratio, eq. (2), if the run takes the

@@ -762,7 +762,7 @@ class TrajectoryFitter:
             damping=fit_state.damping,
             state_damping=(
                 fit_state.state_damping
-                if fit_state.has_rough_cost
+                if fit_state.fits_rough_states
                 else np.full_like(fit_state.state_damping, fit_state.damping)
             ),
             # Clipping these parameters after the step would distort it.
@@ -802,7 +802,7 @@ class TrajectoryFitter:
             sample_mask: (R, T, C) samples that count in the cost.
         """
         is_blocked = False
-        if fit_state.has_rough_cost:
+        if fit_state.fits_rough_states:
             point, is_blocked = self._judge_runs(fit_state, point, sample_mask)
         decrease = fit_state.point.cost - point.cost
         # A small gain of some runs is no sign of convergence while the steps of others fail.
@@ -825,33 +825,27 @@ class TrajectoryFitter:
     def _judge_runs(
         self, fit_state: FitState, trial: FitPoint, sample_mask: Mask
     ) -> tuple[FitPoint, bool]:
-        """Update the damping of the initial states of a robot by what a trial gained in each run.
+        """Take a step of initial states in the runs that it improves, and update their damping.
 
         Args:
-            fit_state: state of the fit, changed in place.
+            fit_state: state of a fit of initial states alone, changed in place.
             trial: the simulated trial point.
             sample_mask: (R, T, C) samples that count in the cost.
 
         Returns:
-            The trial point. If only initial states are fitted, it has the trial states in the runs
-            whose cost is lower, and the present ones in the others; the second value tells whether
-            there are others.
+            The trial point with the present states in the runs whose cost is not lower with the
+            trial; and whether there are such runs.
         """
         last = fit_state.point
         last_costs, costs = (
             self._compute_run_costs(p.simulated, p.start.initial_states, sample_mask)
             for p in (last, trial)
         )
-        has_parameters = fit_state.free_indices.size > 0
-        is_moved = (
-            np.full(len(costs), trial.cost < last.cost) if has_parameters else costs < last_costs
-        )
+        is_moved = costs < last_costs
         with np.errstate(all="ignore"):
             decreases = self._compute_squares(last.simulated, sample_mask)
             decreases -= self._compute_squares(trial.simulated, sample_mask)
         fit_state.adapt_state_damping(decreases, is_moved)
-        if has_parameters:
-            return trial, False
         combined = _combine_runs(last, trial, is_moved, np.minimum(costs, last_costs))
         return combined, bool((costs > last_costs).any())
 

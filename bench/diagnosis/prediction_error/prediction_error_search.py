@@ -93,6 +93,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     fit_nearby,
     fit_quick_selection,
     fit_selection,
+    fit_states_alone,
     is_at_noise,
     is_explained,
     is_nearly_explained,
@@ -117,6 +118,8 @@ from sims.core.simulator import Array
 
 MIN_INCOMPLETE_SHARE = 0.6
 """Minimum share of the joints of a real arm whose servo or friction the model lacks."""
+MIN_STATE_GAIN = 3.0
+"""Minimum decrease of the cost, in units of the noise, by a fit of first states alone."""
 SLOW_TEST_STEPS = 4
 """Maximum number of steps of the fit that tests an effect that is slow to simulate."""
 TRIED_SHARES = (1.0, 0.5)
@@ -388,14 +391,15 @@ class PredictionErrorSearch(EffectSearch):
     def fit_to_convergence(self, model: FittedModel) -> FittedModel:
         """Return the model fitted to final convergence.
 
-        For a robot on the ground, derivatives by differences over wide changes of the coefficients
-        then replace those by small changes, since these show the jumps of contacts and would make
-        the intervals of the coefficients too narrow.
+        It is first fitted again from first states that are better for its parameters, if there are
+        any. For a robot on the ground, derivatives by differences over wide changes of the
+        coefficients then replace those by small changes, since these show the jumps of contacts and
+        would make the intervals of the coefficients too narrow.
 
         Args:
             model: model whose coefficients are reported.
         """
-        model = super().fit_to_convergence(model)
+        model = super().fit_to_convergence(self._refit_states(model))
         filters = self._search_context.filters
         is_fitted = bool(model.effects) and np.isfinite(model.fit.cost)
         if not is_fitted or not self.has_contact_jumps:
@@ -412,6 +416,19 @@ class PredictionErrorSearch(EffectSearch):
         self.refined_jacobians[id(refined.fit)] = refined.fit, refined.fit
         self.models[frozenset(model.effects)] = refined
         return refined
+
+    def _refit_states(self, model: FittedModel) -> FittedModel:
+        """Fit a model again if a fit of its first states alone improves it.
+
+        Args:
+            model: the fitted model; it is returned without effects or if its simulation fails.
+        """
+        if not model.effects or not np.isfinite(model.fit.cost):
+            return model
+        fit = fit_states_alone(self._search_context, model)
+        if fit.cost > model.fit.cost - MIN_STATE_GAIN:
+            return model
+        return select_likeliest(model, self.fit_one(fit.make_start()))
 
     def refit_first_states(self, model: FittedModel) -> FittedModel:
         """Fit a model that leaves more than noise again from better first states, if there are any.

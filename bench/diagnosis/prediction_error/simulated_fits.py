@@ -15,8 +15,9 @@ import numpy as np
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import compute_start_costs
 from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.friction_form_verdict import has_dry_friction
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
@@ -77,8 +78,9 @@ def fit_by_simulation(
     2. Stop if it explains the runs, if its simulation fails, or if it leaves much of the
        discrepancy because it is incomplete: a force is missing in addition to its effects, or at a
        joint where none of them acts.
-    3. Fit it again with derivatives by the first states about the simulated motion, because those
-       about the measured motion may be invalid.
+    3. Fit the first states alone, which is more robust than a fit of all together, and then all
+       again, with derivatives by the first states about the simulated motion, because those about
+       the measured motion may be invalid.
     4. Fit dry friction again from nearby coefficients, because its fit may stop in a local minimum.
        Where servos reach their force limits, this is done for all small effects.
 
@@ -102,10 +104,9 @@ def fit_by_simulation(
         return fitted
     # Replace the derivatives by first states in the evaluator, where fits find them.
     derivatives_before = evaluator.state_derivatives
-    compute_state_jacobian(
-        evaluator, fitted.fit.theta, fitted.fit.initial_states, is_recomputed=True
-    )
-    fitted = search.fit_one(fitted.fit.make_start())
+    start = fit_states_alone(context, fitted).make_start()
+    compute_state_jacobian(evaluator, start.theta, start.initial_states, is_recomputed=True)
+    fitted = search.fit_one(start)
     if not is_explained(context, fitted):
         # Derivatives about a wrong motion are not valid for other models.
         evaluator.state_derivatives = derivatives_before
@@ -116,6 +117,21 @@ def fit_by_simulation(
         if may_stop_early and not is_explained(context, fitted):
             fitted = fit_nearby(context, fitted, name)
     return fitted
+
+
+def fit_states_alone(context: SearchContext, model: FittedModel) -> TrajectoryFit:
+    """Return a fit of the first states with the parameters of a model.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        model: the fitted model.
+    """
+    search = context.search
+    fitter = TrajectoryFitter(
+        context.evaluator, search.noise, search.fixed_parameters, fits_parameters=False
+    )
+    (fit,) = fitter.fit_models([model.fit.make_start()])
+    return fit
 
 
 def make_filtered_start(context: SearchContext, current: FilteredSet) -> FitStart:
