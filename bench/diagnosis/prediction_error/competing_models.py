@@ -32,6 +32,7 @@ from bench.diagnosis.prediction_error.forward_selection_by_filters import try_on
 from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
 from bench.diagnosis.prediction_error.regression_selection import Regression
 from bench.diagnosis.prediction_error.simulated_fits import (
+    MAX_SINGLE_SQUARES_SHARE,
     fit_filtered,
     is_explained,
     is_nearly_explained,
@@ -41,7 +42,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
     MAX_IMPROVED_SIZE,
-    MAX_SINGLE_SQUARES_SHARE,
     refine_single_effects,
     scale_effect,
 )

@@ -25,6 +25,7 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
+    compute_likely_cost,
     drop_surplus_effects,
     fit_by_simulation,
     is_explained,
@@ -45,8 +46,6 @@ MIN_LEAD_SHARE = 0.1
 
 It is a share of the gain over the base model.
 """
-MAX_SOFT_SQUARES_SHARE = 0.3
-"""Maximum share of the squared residual that soft dry friction alone leaves before any fit."""
 
 
 class SoftFrictionError(Exception):
@@ -139,7 +138,7 @@ def check_simulated_soft_friction(context: SearchContext) -> None:
         context: search, filters and regressions of the recording.
 
     Raises:
-        SoftFrictionError: soft friction leaves at most `MAX_SOFT_SQUARES_SHARE`.
+        SoftFrictionError: soft friction leaves little more than noise before any fit.
     """
     filters, evaluator = context.filters, context.evaluator
     if filters.is_soft or not filters.base.has_missing_force:
@@ -165,7 +164,7 @@ def check_simulated_soft_friction(context: SearchContext) -> None:
     finally:
         soft_evaluator.close()
     best = int(np.argmin(costs))
-    if costs[best] < MAX_SOFT_SQUARES_SHARE * context.search.base_model.fit.cost:
+    if costs[best] < compute_likely_cost(context):
         raise SoftFrictionError(starts[best], is_preliminary=True)
 
 

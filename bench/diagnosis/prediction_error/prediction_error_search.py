@@ -89,6 +89,7 @@ from bench.diagnosis.prediction_error.servo_identification import (
 from bench.diagnosis.prediction_error.settled_simulations import refine_with_wide_differences
 from bench.diagnosis.prediction_error.simulated_fits import (
     RatedStart,
+    compute_likely_cost,
     fit_by_simulation,
     fit_nearby,
     fit_quick_selection,
@@ -101,7 +102,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     remove_idle_effects,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
-    MAX_SINGLE_SQUARES_SHARE,
     fit_likely_effects,
     fit_series_effects,
     fit_single_effects,
@@ -283,7 +283,7 @@ class PredictionErrorSearch(EffectSearch):
         series: list[RatedStart] | None = None
         if self._should_continue(best):
             series = simulate_series_effects(context, selected_with_shapes)
-            likely_series = fit_series_effects(context, series, MAX_SINGLE_SQUARES_SHARE)
+            likely_series = fit_series_effects(context, series, compute_likely_cost(context))
             best = select_likeliest(best, likely_series)
         if self._should_continue(best):
             best = self._add_missing_effects(best, selected, friction)

@@ -53,6 +53,8 @@ MIN_FURTHER_GAIN_SHARE = 0.01
 The model of a real robot is never complete, and long recordings show this with certainty.
 """
 
+MAX_SINGLE_SQUARES_SHARE = 0.3
+"""Maximum share of the squares beyond noise that a likely effect leaves before any fit."""
 MAX_NOISE_LIKE_COST = 1.5
 """Maximum mean squared residual, in units of the noise, at which no better start is searched."""
 
@@ -221,6 +223,19 @@ def select_lowest_of_each(context: SearchContext, starts: Sequence[FitStart]) ->
     for i in np.argsort(costs, kind="stable").tolist():
         best_of_each_set.setdefault(starts[i].effects, RatedStart(float(costs[i]), starts[i]))
     return list(best_of_each_set.values())
+
+
+def compute_likely_cost(context: SearchContext) -> float:
+    """Return the cost below which a start that was simulated without a fit is likely.
+
+    It is that of noise plus the share `MAX_SINGLE_SQUARES_SHARE` of what the base model leaves
+    beyond noise.
+
+    Args:
+        context: search, filters and regressions of the recording.
+    """
+    noise = float(context.filters.base.runs.recorded.sum())
+    return noise + MAX_SINGLE_SQUARES_SHARE * max(context.search.base_model.fit.cost - noise, 0.0)
 
 
 def has_noise_like_cost(context: SearchContext, rated_starts: Sequence[RatedStart]) -> bool:

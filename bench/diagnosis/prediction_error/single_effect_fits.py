@@ -27,6 +27,7 @@ from bench.diagnosis.prediction_error.effects_at_joints import (
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
     RatedStart,
+    compute_likely_cost,
     fit_by_simulation,
     fit_nearby,
     has_noise_like_cost,
@@ -45,8 +46,6 @@ SCANNED_FACTORS = (0.5, 2.0, 4.0)
 """Factors of a proposed coefficient at which an effect alone is also simulated."""
 CLOSER_FACTORS = ((0.7, 0.84, 1.2, 1.4), (0.92, 0.96, 1.04, 1.09))
 """Factors of the best scanned coefficient that are simulated next, in two rounds."""
-MAX_SINGLE_SQUARES_SHARE = 0.3
-"""Maximum share of the squared residual that a single likely effect leaves before any fit."""
 MIN_FAMILY_SQUARES_SHARE = 0.05
 """Minimum share of its squared residual by which an effect at all places beats one of its places.
 """
@@ -76,7 +75,7 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     Returns:
         Costs and starts with one effect each, in ascending order of the cost.
     """
-    search, filters = context.search, context.filters
+    filters = context.filters
     states = filters.estimate_first_states(filters.base)
     proposed = [
         replace(start, initial_states=states)
@@ -85,7 +84,7 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     rated_starts = select_lowest_of_each(context, proposed)
     if not has_noise_like_cost(context, rated_starts):
         rated_starts = _try_scaled(context, rated_starts, SCANNED_FACTORS)
-    limit = MAX_SINGLE_SQUARES_SHARE * search.base_model.fit.cost
+    limit = compute_likely_cost(context)
     return _drop_families(context, [rated for rated in rated_starts if rated.cost < limit])
 
 
@@ -293,20 +292,19 @@ def simulate_series_effects(context: SearchContext, selected: Selected) -> list[
 
 
 def fit_series_effects(
-    context: SearchContext, simulated: Sequence[RatedStart], max_share: float = np.inf
+    context: SearchContext, simulated: Sequence[RatedStart], limit: float = np.inf
 ) -> FittedModel:
     """Fit elastic joints and backlash that were not fitted before, the likeliest to convergence.
 
     Args:
         context: search, filters and regressions of the recording.
         simulated: start of each effect (`simulate_series_effects`).
-        max_share: maximum share of the squared residual of the base model that a start leaves.
+        limit: cost below which a start is fitted.
 
     Returns:
         The fitted model, whether or not it is good; the base model if there are no such effects.
     """
     search = context.search
-    limit = max_share * search.base_model.fit.cost
     starts = [
         start
         for cost, start in simulated
