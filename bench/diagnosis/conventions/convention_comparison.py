@@ -98,6 +98,11 @@ PART_SAMPLES = 60
 """Number of samples of the part of a run on which hypotheses are compared."""
 PART_RUNS = 3
 """Maximum number of runs of which parts are used."""
+MAX_EVALUATIONS = 200
+"""Number of filters after which no further hypothesis of one round is compared.
+
+A hand whose fingers touch lacks forces at all of its sixteen joints, with hundreds of hypotheses.
+"""
 MAX_REFINED = 4
 """Maximum number of hypotheses whose offsets are refined."""
 MAX_DIFFERENCES = 3
@@ -355,7 +360,10 @@ class ConventionComparison:
         force_error = self._compute_log_force_error(described, recording, worst_run)
         best_by_description: dict[str, tuple[float, ConventionHypothesis]] = {}
         evaluated_changes: list[object] = []
+        last_evaluation = self.evaluations + MAX_EVALUATIONS
         for hypothesis in self._generator.generate(recording, suspects):
+            if self.evaluations >= last_evaluation:
+                break
             key = dict(hypothesis.changes), hypothesis.late
             if key in evaluated_changes:
                 continue

@@ -203,33 +203,33 @@ class HypothesisGenerator:
     def generate(
         self, recording: Recording, suspects: Sequence[JointSignals]
     ) -> Iterator[ConventionHypothesis]:
-        """Yield hypotheses about the conventions of the log, those about single joints first.
+        """Yield hypotheses about the conventions of the log, those about many joints first.
 
-        1. Signs, zero positions and units of each suspect joint, and its wrapped angles.
-        2. Orders of the joints.
-        3. Units of the whole log, if at least half of the joints are suspects.
-        4. Commands that are recorded late.
+        1. Units of the whole log, if at least half of the joints are suspects.
+        2. Commands that are recorded late.
+        3. Signs, zero positions and units of each suspect joint, and its wrapped angles.
+        4. Orders of the joints.
 
         Args:
             recording: Recording as read, or with some conventions corrected.
             suspects: Joints whose own conventions are tested.
         """
-        # 1. Single joints.
+        # 1. The whole log.
         suspects = [joint for joint in suspects if joint.channels]
+        if 2 * len(suspects) >= len(self.joints):
+            yield from self._generate_common_units(recording)
+            yield from self._generate_normalised_positions()
+        # 2. Late commands.
+        yield from _generate_late_commands(recording)
+        # 3. Single joints.
         for joint in suspects:
             yield from _generate_signs(joint)
             yield from _generate_zero_offsets(joint, recording)
             for name in dict.fromkeys((*joint.channels.values(), *joint.inputs)):
                 yield from _generate_units([self._signals[name]], recording)
         yield from _generate_wrapped_angles(suspects, recording)
-        # 2. Orders.
+        # 4. Orders.
         yield from _generate_joint_orders(self.joints, recording, suspects)
-        # 3. The whole log.
-        if 2 * len(suspects) >= len(self.joints):
-            yield from self._generate_common_units(recording)
-            yield from self._generate_normalised_positions()
-        # 4. Late commands.
-        yield from _generate_late_commands(recording)
 
     def _generate_common_units(self, recording: Recording) -> Iterator[ConventionHypothesis]:
         """Yield hypotheses that all positions, commands, velocities or torques have another unit.

@@ -8,9 +8,8 @@ import pytest
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
 from bench.diagnosis.prediction_error import single_effect_fits
 from bench.diagnosis.prediction_error.regression_columns import list_probes
-from bench.diagnosis.prediction_error.simulated_fits import RatedStart
+from bench.diagnosis.prediction_error.simulated_fits import RatedStart, compute_likely_cost
 from bench.diagnosis.prediction_error.single_effect_fits import (
-    MAX_SINGLE_SQUARES_SHARE,
     SMALLER_SERIES_SHARES,
     fit_series_effects,
     simulate_series_effects,
@@ -64,15 +63,29 @@ def test_smaller_gaps_than_those_of_the_probes_are_simulated(example_arm, simula
     np.testing.assert_allclose(gaps[2:], sorted(probed))
 
 
+def test_a_likely_effect_leaves_noise_and_a_share_of_the_discrepancy():
+    def compute(base_cost, samples):
+        recorded = np.ones((1, samples, 1), dtype=bool)
+        runs = SimpleNamespace(recorded=recorded)
+        context = SimpleNamespace(
+            filters=SimpleNamespace(base=SimpleNamespace(runs=runs)),
+            search=SimpleNamespace(base_model=SimpleNamespace(fit=SimpleNamespace(cost=base_cost))),
+        )
+        return compute_likely_cost(context)
+
+    assert compute(3000.0, 1000) == pytest.approx(1600.0)
+    assert compute(900.0, 1000) == 1000.0
+
+
 @pytest.mark.parametrize(
-    ("max_share", "expected"),
+    ("limit", "expected"),
     [
-        (MAX_SINGLE_SQUARES_SHARE, ["joint.backlash@elbow"]),
+        (0.3 * BASE_COST, ["joint.backlash@elbow"]),
         (np.inf, ["joint.backlash@elbow", "joint.backlash@shoulder"]),
     ],
 )
 def test_early_only_effects_that_remove_most_of_the_residual_are_fitted(
-    monkeypatch, max_share, expected
+    monkeypatch, limit, expected
 ):
     """Effects that were fitted before are left out."""
     costs = {
@@ -95,5 +108,5 @@ def test_early_only_effects_that_remove_most_of_the_residual_are_fitted(
         models={frozenset(["joint.flexibility@elbow"]): None},
         fit_all=fit_all,
     )
-    fit_series_effects(SimpleNamespace(search=search), starts, max_share)
+    fit_series_effects(SimpleNamespace(search=search), starts, limit)
     assert fitted == expected
