@@ -803,7 +803,7 @@ class TrajectoryFitter:
         """
         is_blocked = False
         if fit_state.fits_rough_states:
-            point, is_blocked = self._judge_runs(fit_state, point, sample_mask)
+            point, is_blocked = self._step_improved_runs(fit_state, point, sample_mask)
         decrease = fit_state.point.cost - point.cost
         # A small gain of some runs is no sign of convergence while the steps of others fail.
         is_accepted = decrease > (fit_state.get_tolerance(point.cost) if is_blocked else 0.0)
@@ -822,7 +822,7 @@ class TrajectoryFitter:
         else:
             fit_state.reject_step()
 
-    def _judge_runs(
+    def _step_improved_runs(
         self, fit_state: FitState, trial: FitPoint, sample_mask: Mask
     ) -> tuple[FitPoint, bool]:
         """Take a step of initial states in the runs that it improves, and update their damping.
