@@ -30,6 +30,7 @@ from bench.diagnosis.report.report_data import (
     GapLocation,
     ParameterChange,
 )
+from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
 from bench.diagnosis.verdict import Cause, HeldOutResult
 from bench.pages.template import load_template
 from sims.core.root_mean_square import compute_rms
@@ -64,6 +65,7 @@ def _load_sentences() -> Any:
             "gaps": detectable_gap,
             "wording": wording,
             "MAX_SENTENCES_ON_PARAMETERS": MAX_SENTENCES_ON_PARAMETERS,
+            "significance_level": EFFECT_P_VALUE_THRESHOLD,
         }
     )
 

@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -136,6 +137,16 @@ def test_a_weak_cause_under_unknown_is_not_sold_as_the_answer():
     assert format_gain(told).startswith(
         "The best of them, linear drag, closes only 30 % of the gap (10 to 50 %)"
     )
+
+
+def test_a_score_that_simulations_do_not_confirm_is_not_called_insignificant():
+    report = make_report("adequate")
+    candidates = [replace(candidate, p_value=1e-9) for candidate in report.verdict.candidates]
+    report = replace(report, verdict=replace(report.verdict, candidates=candidates))
+    said = " ".join(format_gain_and_caveats(report))
+    assert "tested and none improves the simulation significantly; the most promising is" in said
+    assert "p <" not in said
+    assert "p = " not in said
 
 
 def test_adequate_says_what_was_looked_for_and_what_could_hide():
