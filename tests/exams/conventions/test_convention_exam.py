@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bench.cli.main import main
+from bench.diagnosis.conventions import convention_comparison
 from bench.diagnosis.conventions.convention_comparison import (
     ConventionComparison,
     ConventionDifference,
@@ -93,6 +94,16 @@ CORRECT_LOGS = [*((cause, 2000 + k) for k, cause in enumerate(CAUSES)), ("fricti
 def test_a_cause_is_no_broken_convention(cause, seed, tmp_path):
     log = write_log(tmp_path / "log", seed, None, cause)
     assert check(log.path).differences() == []
+
+
+def test_a_round_ends_after_a_number_of_filters(tmp_path, monkeypatch):
+    (broken,) = QUICK
+    log = write_log(tmp_path / "log", SEEDS[broken][0], broken)
+    monkeypatch.setattr(convention_comparison, "MAX_EVALUATIONS", 6)
+    comparison = check(log.path)
+    assert comparison.differences() == []
+    # The log as described is compared as a whole and in three parts before.
+    assert comparison.evaluations <= 4 + 6 + 1
 
 
 def test_an_identity_transform_is_no_difference(tmp_path, monkeypatch):
