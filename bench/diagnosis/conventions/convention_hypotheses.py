@@ -203,7 +203,7 @@ class HypothesisGenerator:
     def generate(
         self, recording: Recording, suspects: Sequence[JointSignals]
     ) -> Iterator[ConventionHypothesis]:
-        """Yield hypotheses about the conventions of the log, those about many joints first.
+        """Yield hypotheses about the conventions of the log, those about the whole log first.
 
         1. Units of the whole log, if at least half of the joints are suspects.
         2. Commands that are recorded late.

@@ -215,6 +215,18 @@ class FitPoint:
     cost: float
 
 
+def reduce_damping(damping: Array | float, gain_ratio: Array | float) -> Array:
+    """Return the damping after an accepted step with a gain ratio, eq. (2) of the module docstring.
+
+    Args:
+        damping: damping λ; a number or any shape.
+        gain_ratio: gain ratio ρ of the same shape.
+    """
+    factor = np.maximum(MIN_DAMPING_FACTOR, 1.0 - (2.0 * np.asarray(gain_ratio) - 1.0) ** 3)
+    reduced: Array = np.maximum(damping * factor, MIN_DAMPING)
+    return reduced
+
+
 @dataclass
 class FitState:
     """State of the fit of one model.
@@ -276,6 +288,12 @@ class FitState:
     own_state_cost: float = np.inf
     can_stick: bool = False
     has_unreliable_states: bool = False
+
+    def compute_state_damping(self) -> Array:
+        """Return the damping (R, s) of each initial state for the next step."""
+        if self.fits_rough_states:
+            return self.state_damping
+        return np.full_like(self.state_damping, self.damping)
 
     @property
     def fits_rough_states(self) -> bool:
@@ -441,8 +459,7 @@ class FitState:
         self.is_jacobian_stale = (
             not self.has_own_jacobian and abs(gain_ratio - 1.0) > JACOBIAN_REUSE_TOLERANCE
         )
-        factor = max(MIN_DAMPING_FACTOR, 1.0 - (2.0 * gain_ratio - 1.0) ** 3)
-        self.damping = max(self.damping * factor, MIN_DAMPING)  # (2)
+        self.damping = float(reduce_damping(self.damping, gain_ratio))
         self.growth = INITIAL_DAMPING_GROWTH
         # Far from the data, the fit hardly gains any more.
         is_stagnant = gain_ratio < STAGNANT_RATIO and decrease < STAGNANT_SHARE * cost
@@ -475,13 +492,12 @@ class FitState:
             loss = predicted - actual
             is_bad = ~(loss <= MAX_LOSS_SHARE * np.abs(predicted) + CONVERGENCE_TOLERANCE)
             gain_ratios = np.clip(actual / np.maximum(predicted, 1e-300), 0.0, 1.0)
-        factors = np.maximum(MIN_DAMPING_FACTOR, 1.0 - (2.0 * gain_ratios - 1.0) ** 3)
         is_reduced = (predicted > 0.0) & is_moved[:, None]
-        reduced = np.where(is_reduced, self.state_damping * factors, self.state_damping)
-        grown = INITIAL_DAMPING_GROWTH * self.state_growth
-        self.state_damping = np.where(
-            is_bad, self.state_damping * grown, np.maximum(reduced, MIN_DAMPING)
+        reduced = np.where(
+            is_reduced, reduce_damping(self.state_damping, gain_ratios), self.state_damping
         )
+        grown = INITIAL_DAMPING_GROWTH * self.state_growth
+        self.state_damping = np.where(is_bad, self.state_damping * grown, reduced)
         self.state_growth = np.where(is_bad, grown, INITIAL_DAMPING_GROWTH)
 
     def reject_step(self) -> None:

@@ -687,12 +687,20 @@ class TrajectoryFitter:
 
         It is infinite for a run whose simulation was abandoned.
         """
-        deviation = self._compute_state_deviation(states)
-        squares = self._compute_squares(simulated, sample_mask).sum(axis=1)
+        return self._sum_run_costs(self._compute_squares(simulated, sample_mask), states)
+
+    def _sum_run_costs(self, squares: Array, states: Array) -> Array:
+        """Return the part of each run (R,) in the cost, from its squared residuals.
+
+        Args:
+            squares: (R, C) squared whitened residual of each channel of each run.
+            states: (R, s) initial states.
+        """
         with np.errstate(all="ignore"):
-            squares += np.square(deviation).sum(axis=1)
+            deviation = self._compute_state_deviation(states)
+            sums = squares.sum(axis=1) + np.square(deviation).sum(axis=1)
         # An abandoned batch element is NaN, which cannot be compared.
-        costs: Array = np.where(np.isfinite(squares), squares, np.inf)
+        costs: Array = np.where(np.isfinite(sums), sums, np.inf)
         return costs
 
     def _compute_squares(self, simulated: Array, sample_mask: Mask) -> Array:
@@ -760,11 +768,7 @@ class TrajectoryFitter:
             prior=compute_state_prior(self.evaluator),
             known_mask=self.evaluator.known_state_mask,
             damping=fit_state.damping,
-            state_damping=(
-                fit_state.state_damping
-                if fit_state.fits_rough_states
-                else np.full_like(fit_state.state_damping, fit_state.damping)
-            ),
+            state_damping=fit_state.compute_state_damping(),
             # Clipping these parameters after the step would distort it.
             blocked_mask=fit_state.find_blocked_parameters(residual, jacobian),
         )
@@ -837,15 +841,14 @@ class TrajectoryFitter:
             trial; and whether there are such runs.
         """
         last = fit_state.point
-        last_costs, costs = (
-            self._compute_run_costs(p.simulated, p.start.initial_states, sample_mask)
-            for p in (last, trial)
+        last_squares, squares = (
+            self._compute_squares(point.simulated, sample_mask) for point in (last, trial)
         )
+        last_costs = self._sum_run_costs(last_squares, last.start.initial_states)
+        costs = self._sum_run_costs(squares, trial.start.initial_states)
         is_moved = costs < last_costs
         with np.errstate(all="ignore"):
-            decreases = self._compute_squares(last.simulated, sample_mask)
-            decreases -= self._compute_squares(trial.simulated, sample_mask)
-        fit_state.adapt_state_damping(decreases, is_moved)
+            fit_state.adapt_state_damping(last_squares - squares, is_moved)
         combined = _combine_runs(last, trial, is_moved, np.minimum(costs, last_costs))
         return combined, bool((costs > last_costs).any())
 

@@ -30,8 +30,8 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
 )
 from bench.diagnosis.prediction_error.forward_selection_by_filters import try_one_more_effect
 from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
-from bench.diagnosis.prediction_error.regression_selection import Regression
 from bench.diagnosis.prediction_error.simulated_fits import (
+    MAX_IMPROVED_SIZE,
     MAX_SINGLE_SQUARES_SHARE,
     fit_filtered,
     is_explained,
@@ -41,12 +41,10 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     select_lowest_of_each,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
-    MAX_IMPROVED_SIZE,
     refine_single_effects,
     scale_effect,
 )
 from bench.diagnosis.search.alternative_causes import differ_in_one_effect
-from bench.diagnosis.search.score_test import DirectionGroup
 from sims.core.simulator import Array
 
 FURTHER_STEPS = 4
@@ -174,7 +172,7 @@ def replace_by_richer_laws(context: SearchContext, best: FittedModel) -> FittedM
             continue
         regression, own_columns = context.columns.regression(best)
         remaining = regression.make_regression_without(own_columns[name])
-        groups = [g for g, _ in _rank_effects(remaining) if g.effect in richer_laws]
+        groups = [g for g, _ in remaining.rank_effects() if g.effect in richer_laws]
         for group in groups[:MAX_RICHER_LAWS]:
             coefficients = context.columns.solve_alone(remaining, group)
             starts.append(make_replacing_start(evaluator, best, [name], group.effect, coefficients))
@@ -374,7 +372,7 @@ def _find_competing_effects(
     own_gain = remaining.compute_gain(own_columns[name]) - context.filters.penalty(name)
     same_joint = list_joint_model_effects(evaluator, name)
     competing_effects, near_count = dict[str, _CompetingEffect](), 0
-    for group, gain in _rank_effects(remaining):
+    for group, gain in remaining.rank_effects():
         effect, loss = group.effect, own_gain - gain
         # Forces of any shape are candidates too, but no effects of the library.
         if effect not in evaluator.library or effect in model.effects:
@@ -391,20 +389,6 @@ def _find_competing_effects(
         if effect not in model.effects:
             competing_effects[effect] = _CompetingEffect(effect, coefficients, np.inf)
     return list(competing_effects.values())
-
-
-def _rank_effects(regression: Regression) -> list[tuple[DirectionGroup, float]]:
-    """Return the best shape of each effect of a regression with its gain, the largest gain first.
-
-    Gains are in twice the log-likelihood, minus the penalty of the effect: effects with more
-    coefficients gain more under the null hypothesis.
-    """
-    gains = regression.compute_net_gains()
-    best_of_each = dict[str, tuple[DirectionGroup, float]]()
-    for i in np.argsort(-gains, kind="stable").tolist():
-        group = regression.groups[i]
-        best_of_each.setdefault(group.effect, (group, float(gains[i])))
-    return list(best_of_each.values())
 
 
 def _confirm(

@@ -221,16 +221,15 @@ class EffectProposals:
             regression: regression of innovations on the responses to each effect.
             present_names: names of effects that the model has already.
         """
-        gains = regression.compute_net_gains()
+        ranked = regression.rank_effects()
         proposals: Proposals = {}
-        for i in np.argsort(-gains, kind="stable").tolist():
-            group = regression.groups[i]
+        for group, gain in ranked:
             families = [name for name in proposals if name.endswith("@*")]
             is_surplus = group.effect.endswith("@*") and len(families) == MAX_FAMILY_PROPOSALS
-            if is_surplus or group.effect in (*present_names, *proposals):
+            if is_surplus or group.effect in present_names:
                 continue
             # Gains are in descending order, so all further ones are too small, too.
-            is_small = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
+            is_small = gain < max(MIN_GAIN_SHARE * ranked[0][1], 0.0)
             if len(proposals) == MAX_SIMULATED_PROPOSALS or is_small:
                 break
             proposals[group.effect] = self.columns.solve_alone(regression, group)
@@ -253,17 +252,16 @@ class EffectProposals:
         assert isinstance(simulator, RobotSimulator)
         if not simulator.robot.compiled.dof_frictionloss.any():
             return {}
-        groups, gains = regression.groups, regression.compute_net_gains()
         masses = [
-            i
-            for i in np.argsort(-gains, kind="stable").tolist()
-            if groups[i].effect.startswith("mass.scale@")
-            and not groups[i].effect.endswith("@*")
-            and gains[i] > 0.0
+            group
+            for group, gain in regression.rank_effects()
+            if group.effect.startswith("mass.scale@")
+            and not group.effect.endswith("@*")
+            and gain > 0.0
         ]
         return {
-            groups[i].effect: self.columns.solve_alone(regression, groups[i])
-            for i in masses[:MAX_MASS_PROPOSALS]
+            group.effect: self.columns.solve_alone(regression, group)
+            for group in masses[:MAX_MASS_PROPOSALS]
         }
 
     def _propose_offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:

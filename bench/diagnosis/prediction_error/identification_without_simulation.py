@@ -45,8 +45,10 @@ from bench.diagnosis.prediction_error.regression_columns import (
     build_regression_about,
     group_coefficients,
 )
-from bench.diagnosis.prediction_error.simulated_fits import MIN_FURTHER_GAIN_SHARE
-from bench.diagnosis.prediction_error.single_effect_fits import MAX_IMPROVED_SIZE
+from bench.diagnosis.prediction_error.simulated_fits import (
+    MAX_IMPROVED_SIZE,
+    MIN_FURTHER_GAIN_SHARE,
+)
 from bench.diagnosis.search.fit_starts import add_effect_to_start
 
 MIN_SECONDS = 8.0

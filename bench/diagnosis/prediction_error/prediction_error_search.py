@@ -15,8 +15,8 @@ residual of a set is only noise. The order is:
        If this fails too, or before it if servos reach their limits, simulate single effects at
        several coefficients, and fit the best of them (`single_effect_fits`).
     2. If a force is still missing, select again, with effects of many shapes at the joints where it
-       is missing (`regression_columns`), and try richer laws in place of those that leave a
-       residual (`competing_models`).
+       is missing (`regression_columns`), and replace laws that do not explain the runs by richer
+       ones (`competing_models`).
     3. Fit each of the effects with the largest gains alone, and those of the standard joint model
        (`single_effect_fits`, `effect_proposals`).
     4. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
@@ -41,7 +41,11 @@ from functools import cached_property
 import numpy as np
 
 from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
-from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
+from bench.diagnosis.fitting.fitted_models import (
+    MAX_ITERATIONS,
+    FittedModel,
+    select_likeliest,
+)
 from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.friction_form_verdict import has_dry_friction
@@ -226,8 +230,8 @@ class PredictionErrorSearch(EffectSearch):
         4. dry friction alone, then the set that regression selects, with a lag in place of a delay
            or the reverse, then the set that regressions with dry friction of all joints in the
            model select, then soft dry friction of one joint;
-        5. effects with many shapes, such as forces of any period, then richer laws in place of
-           those that leave a residual;
+        5. effects with many shapes, such as forces of any period, then richer laws at the same
+           places;
         6. series effects (elastic or slack transmissions) that remove most of the residual;
         7. effects that regression missed: singly, then one by one in addition to others;
         8. one effect in place of several;
@@ -399,7 +403,7 @@ class PredictionErrorSearch(EffectSearch):
         Args:
             model: model whose coefficients are reported.
         """
-        model = super().fit_to_convergence(self._refit_states(model))
+        model = super().fit_to_convergence(self._refit_from_better_states(model))
         filters = self._search_context.filters
         is_fitted = bool(model.effects) and np.isfinite(model.fit.cost)
         if not is_fitted or not self.has_contact_jumps:
@@ -417,7 +421,7 @@ class PredictionErrorSearch(EffectSearch):
         self.models[frozenset(model.effects)] = refined
         return refined
 
-    def _refit_states(self, model: FittedModel) -> FittedModel:
+    def _refit_from_better_states(self, model: FittedModel) -> FittedModel:
         """Fit a model again if a fit of its first states alone improves it.
 
         Args:
@@ -550,7 +554,7 @@ class PredictionErrorSearch(EffectSearch):
         if p_value_by_filter > EFFECT_P_VALUE_THRESHOLD:
             return p_value_by_filter
         is_slow = is_slow_to_simulate(self._search_context, [name])
-        larger = self.fit_one(start, *([SLOW_TEST_STEPS] if is_slow else []))
+        larger = self.fit_one(start, SLOW_TEST_STEPS if is_slow else MAX_ITERATIONS)
         gain = larger.likelihood.value - model.likelihood.value
         return compute_p_value_of_gain(gain, len(indices), library_size)
 

@@ -283,6 +283,15 @@ class Regression:
         net: Array = self.gains(chosen) - prices
         return net
 
+    def rank_effects(self) -> list[tuple[DirectionGroup, float]]:
+        """Return the best shape of each effect with its net gain, the largest gain first."""
+        gains = self.compute_net_gains()
+        best_of_each = dict[str, tuple[DirectionGroup, float]]()
+        for i in np.argsort(-gains, kind="stable").tolist():
+            group = self.groups[i]
+            best_of_each.setdefault(group.effect, (group, float(gains[i])))
+        return list(best_of_each.values())
+
     def _list_contained_effects(self, chosen: Sequence[DirectionGroup]) -> list[str]:
         """Return the effects of a set, with all effects that they contain."""
         effects = [group.effect for group in chosen]

@@ -30,8 +30,8 @@ from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
 NEARBY_FACTORS = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
 """Factors of a coefficient at which a fit looks for a lower cost nearby."""
-MAX_NEARBY_SIZE = 3
-"""Maximum number of coefficients of an effect that is fitted again from nearby ones."""
+MAX_IMPROVED_SIZE = 3
+"""Maximum number of coefficients of an effect that is improved alone, such as from nearby ones."""
 EXPLAINED_EXCESS = 0.03
 """Maximum excess over the noise of a fitted set that explains the data; see `is_at_noise`."""
 NEARLY_EXPLAINED_SHARE = 0.1
@@ -114,7 +114,7 @@ def fit_by_simulation(
         evaluator.state_derivatives = derivatives_before
     has_jumps = bool(context.filters.base.runs.jumps.any())
     for name in fitted.effects:
-        is_small = len(evaluator.get_coefficient_indices(name)) <= MAX_NEARBY_SIZE
+        is_small = len(evaluator.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE
         may_stop_early = has_dry_friction(evaluator, [name]) or (has_jumps and is_small)
         if may_stop_early and not is_explained(context, fitted):
             fitted = fit_nearby(context, fitted, name)

@@ -26,6 +26,7 @@ from bench.diagnosis.prediction_error.effects_at_joints import (
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
+    MAX_IMPROVED_SIZE,
     RatedStart,
     compute_likely_cost,
     fit_by_simulation,
@@ -59,8 +60,6 @@ MAX_REFINED = 3
 """Maximum number of effects that are fitted alone to convergence."""
 SMALLER_SERIES_SHARES = (0.1, 0.35)
 """Shares of the smallest trial compliance or gap that are tried too."""
-MAX_IMPROVED_SIZE = 3
-"""Maximum number of coefficients of an effect that is refined alone or improved by a filter."""
 
 
 def list_likely_starts(context: SearchContext) -> list[RatedStart]:
