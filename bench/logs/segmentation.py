@@ -77,7 +77,7 @@ def segment_recording(
     if seconds is None and (whole or not kind.has_model):
         return SegmentedRecording(recording, "")
     robot: Any = kind
-    is_floating = kind.has_model and bool(robot.system.floating_state_units)
+    is_floating = kind.has_model and bool(robot.system.required_state_units)
     if is_floating and seconds is not None:
         raise InputError(
             f"{recording.path}: expected no --pieces: {recording.system} has a floating base, "

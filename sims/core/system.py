@@ -222,8 +222,10 @@ class System(ABC):
         states: Default values of both.
         bounces: Whether its last coordinate strikes the ground at `floor`.
         floating_state_units: Units by name of the poses and velocities of floating bodies, which
-            are states but no coordinates: they are known at the beginning of a run, but not at the
-            beginning of a part of a run.
+            are states but no coordinates.
+        required_state_units: Those of them that do not follow from closed loops: they are known at
+            the beginning of a run, where a recording has to state them, but not at the beginning of
+            a part of a run.
         base_orientations: Orientation (w, x, y, z) in the model file of each floating body whose
             pose is recorded, by the name of its joint.
         loops: Coordinates that constraints couple, such as those of a four-bar linkage, as sets of
@@ -259,6 +261,7 @@ class System(ABC):
     servo: ClassVar[str] = ""
     bounces: ClassVar[bool] = False
     floating_state_units: ClassVar[Mapping[str, str]] = {}
+    required_state_units: ClassVar[Mapping[str, str]] = {}
     base_orientations: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     loops: ClassVar[Sequence[frozenset[int]]] = ()
     guided: ClassVar[int] = 0

@@ -311,6 +311,18 @@ def get_floating_state_units(declared: DeclaredSignals) -> Mapping[str, str]:
     return units
 
 
+def get_required_state_units(declared: DeclaredSignals) -> Mapping[str, str]:
+    """Return the units of the states that every run has to state, by name; usually none.
+
+    They are those of floating bodies whose pose does not follow from closed loops.
+
+    Args:
+        declared: System, or simulator of it.
+    """
+    units: Mapping[str, str] = getattr(_get_system(declared), "required_state_units", {})
+    return units
+
+
 class _DescriptionReader:
     """Reader of the tables of one description, which are checked against a system."""
 

@@ -101,14 +101,12 @@ class FloatingJoints:
         Positions are in m and velocities in m/s along the world's axes; quaternions have the unit
         1, and angular velocities rad/s.
         """
-        units: dict[str, str] = {}
-        for joint in self.joints:
-            axes = _list_translation_axes(joint)
-            units |= {f"q.{joint.name}.{axis}": "m" for axis in axes}
-            units |= {f"q.{joint.name}.{axis}": "1" for axis in QUATERNION_ENTRIES}
-            units |= {f"qd.{joint.name}.{axis}": "m/s" for axis in axes}
-            units |= {f"qd.{joint.name}.{axis}": "rad/s" for axis in ANGULAR_VELOCITY_AXES}
-        return units
+        return {
+            name: unit
+            for joint in self.joints
+            for units in list_state_units(joint)
+            for name, unit in units.items()
+        }
 
     def states(self) -> dict[str, float]:
         """Return initial states by name: poses from the model file, and velocities of zero."""
@@ -190,6 +188,24 @@ class FloatingJoints:
             mujoco.mj_differentiatePos(self.model, velocities, 1.0, before, after)
             displacement[:] = velocities[self.velocities]
         return displacements
+
+
+def list_state_units(joint: Joint) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the units of a joint's positions by name, and those of its velocities.
+
+    They are in the order of `qpos` and `qvel`; a joint with one coordinate has one of each.
+
+    Args:
+        joint: joint of any kind.
+    """
+    if joint.has_one_coordinate:
+        return {f"q.{joint.name}": joint.unit}, {f"qd.{joint.name}": f"{joint.unit}/s"}
+    axes = _list_translation_axes(joint)
+    positions = {f"q.{joint.name}.{axis}": "m" for axis in axes}
+    positions |= {f"q.{joint.name}.{axis}": "1" for axis in QUATERNION_ENTRIES}
+    velocities = {f"qd.{joint.name}.{axis}": "m/s" for axis in axes}
+    velocities |= {f"qd.{joint.name}.{axis}": "rad/s" for axis in ANGULAR_VELOCITY_AXES}
+    return positions, velocities
 
 
 def _list_translation_axes(joint: Joint) -> tuple[str, ...]:

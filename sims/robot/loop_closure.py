@@ -22,12 +22,18 @@ from typing import Any
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.robot.robot_model import RobotModel
+from sims.robot.floating_joints import list_state_units
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.robot_model import Joint, RobotModel
 
-MAX_STEPS = 20
+MAX_STEPS = 40
 """Maximum number of Gauss-Newton steps at a pose of the measured joints."""
 MAX_MOTION = 0.2
-"""Largest change of a measured joint from one pose to the next, in rad or m."""
+"""Largest change of a joint from one pose to the next, in rad or m."""
+SETTLING_SECONDS = 0.1
+"""Duration for which unmeasured joints settle, several time constants of usual constraints."""
+GUIDED_INERTIA = 1e6
+"""Inertia added to joints with a given motion, in kg m² or kg."""
 POSITION_TOLERANCE = 1e-10
 """Residual of the constraints, in m or rad, at which the loops are closed."""
 
@@ -43,8 +49,8 @@ def close_loops(
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-        states: positions ``q.JOINT`` and velocities ``qd.JOINT`` of its joints.
-        unmeasured: names of the joints to place; the others stay.
+        states: positions and velocities of its joints, such as ``q.JOINT`` and ``qd.JOINT``.
+        unmeasured: names of the joints to place, of any kind; the others stay.
 
     Returns:
         The states with the positions and velocities of the unmeasured joints; if the constraints
@@ -53,69 +59,237 @@ def close_loops(
     import mujoco
 
     # 1. Model and initial state.
-    joints = [joint for joint in robot.joints if f"q.{joint.name}" in states]
     if not unmeasured or not robot.compiled.neq:
         return dict(states)
-    model = copy.copy(robot.compiled)
-    # The Jacobian of the constraints is then a plain matrix.
-    model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
-    data = mujoco.MjData(model)
-    for joint in joints:
-        data.qvel[joint.velocity] = states[f"qd.{joint.name}"]
+    loops = _LoopModel(robot, states, unmeasured)
+    model, data, dofs = loops.model, loops.data, loops.dofs
     # 2. Positions: the measured joints move in small steps from the reference pose to their states,
-    # and the unmeasured ones follow.
-    placed = [joint for joint in joints if joint.name in unmeasured]
-    positions = [joint.position for joint in placed]
-    velocities = np.array([joint.velocity for joint in placed])
-    fixed = [joint for joint in joints if joint.name not in unmeasured]
-    reference = model.qpos0[[joint.position for joint in fixed]]
-    change = np.array([states[f"q.{joint.name}"] for joint in fixed]) - reference
+    # and the unmeasured ones follow. In the reference pose of a file, a linkage may be stretched,
+    # so that two motions are possible; the ranges of its joints tell which one is meant.
+    reference = np.clip(model.qpos0, *loops.ranges)
+    change = np.zeros(model.nv)
+    mujoco.mj_differentiatePos(model, change, 1.0, reference, data.qpos)
+    change[dofs] = 0.0
+    data.qpos[:] = reference
     count = 1 + int(np.abs(change).max(initial=0.0) / MAX_MOTION)
     jacobian: Array | None = None
-    for share in np.arange(1, count + 1) / count:
-        data.qpos[[joint.position for joint in fixed]] = reference + share * change
-        jacobian = _solve_constraints(model, data, positions, velocities)
-        if jacobian is None:
-            return dict(states)
+    for _ in range(count):
+        mujoco.mj_integratePos(model, data.qpos, change, 1.0 / count)
+        jacobian = _solve_constraints(loops)
+    if jacobian is None:
+        return dict(states)
     # 3. Velocities: v_u = -J_u^+ J_m v_m.
-    assert jacobian is not None
-    fixed_rates = data.qvel.copy()
-    fixed_rates[velocities] = 0.0
-    rates = -np.linalg.pinv(jacobian[:, velocities]) @ (jacobian @ fixed_rates)
-    closed = dict(states)
-    for joint, rate in zip(placed, rates.tolist(), strict=True):
-        closed[f"q.{joint.name}"] = float(data.qpos[joint.position])
-        closed[f"qd.{joint.name}"] = rate
-    return closed
+    data.qvel[dofs] = 0.0
+    data.qvel[dofs] = -np.linalg.pinv(jacobian[:, dofs]) @ (jacobian @ data.qvel)
+    return {**states, **loops.get_unmeasured_states()}
 
 
-def _solve_constraints(
-    model: Any, data: Any, positions: Sequence[int], velocities: Array
-) -> Array | None:
-    """Move the unmeasured joints until the equality constraints are satisfied.
+def settle_loops(
+    robot: RobotModel, states: Mapping[str, float], unmeasured: Collection[str]
+) -> dict[str, float]:
+    """Let unmeasured joints of closed loops settle, while the measured ones move evenly.
 
-    Each Gauss-Newton step is q_u <- q_u - J_u^+ r(q) with the residual r of the constraints, their
-    Jacobian J, and its pseudo-inverse for the unmeasured joints u.
+    MuJoCo's constraints are soft: under load, such as that of a spring in the loop, they deflect,
+    and a simulation that begins without the deflection begins with a jump of the forces. The
+    measured joints approach their state with constant velocity for `SETTLING_SECONDS`.
+
+    Args:
+        robot: model of the robot.
+        states: positions and velocities of its joints, in which the loops are closed.
+        unmeasured: names of the joints that settle, of any kind; the others keep their states.
+
+    Returns:
+        The states with the settled ones; the given states if the joints do not settle.
+    """
+    import mujoco
+
+    if not unmeasured or not robot.compiled.neq:
+        return dict(states)
+    loops = _LoopModel(robot, states, unmeasured)
+    model, data = loops.model, loops.data
+    steps = max(round(SETTLING_SECONDS / model.opt.timestep), 1)
+    mujoco.mj_integratePos(model, data.qpos, data.qvel, -steps * model.opt.timestep)
+    if _solve_constraints(loops) is None:
+        return dict(states)
+    loops.guide_measured_joints()
+    with capture_mujoco_warnings() as warnings:
+        mujoco.mj_step(model, data, steps)
+    return {**states, **({} if warnings else loops.get_unmeasured_states())}
+
+
+def follow_measured_joints(
+    robot: RobotModel, step: float, positions: Array, velocities: Array, unmeasured: Collection[str]
+) -> tuple[Array, Array]:
+    """Move unmeasured joints of closed loops as the constraints and the measured joints make them.
+
+    A simulation of the whole robot is far from the measured motion if a number of the model is
+    wrong, so that its unmeasured joints would not fit in the loops. Here only they are simulated.
+
+    Args:
+        robot: model of the robot.
+        step: time step in seconds.
+        positions: (S + 1, nq) positions of all joints at the steps, in the order of qpos.
+        velocities: (S + 1, nv) their velocities, in the order of qvel.
+        unmeasured: names of the joints that are moved from their states in the first row.
+
+    Returns:
+        Positions and velocities with the motion of the unmeasured joints; the given ones if the
+        simulation is unstable.
+    """
+    import mujoco
+
+    loops = _LoopModel(robot, {}, unmeasured)
+    model, data = loops.model, loops.data
+    loops.guide_measured_joints()
+    model.opt.timestep = step
+    followed = positions.copy(), velocities.copy()
+    with capture_mujoco_warnings() as warnings:
+        for k in range(len(positions) - 1):
+            data.qpos[:], data.qvel[:] = followed[0][k], followed[1][k]
+            mujoco.mj_step(model, data)
+            followed[0][k + 1, loops.addresses] = data.qpos[loops.addresses]
+            followed[1][k + 1, loops.dofs] = data.qvel[loops.dofs]
+    return (positions, velocities) if warnings else followed
+
+
+class _LoopModel:
+    """Copy of a robot's model and its data, with the addresses of unmeasured joints.
+
+    Attributes:
+        model: compiled model, whose constraints have a dense Jacobian.
+        data: its state.
+        addresses: addresses of the unmeasured joints in qpos.
+        dofs: their addresses in qvel.
+        ranges: (2, nq) lowest and highest positions of all joints.
+    """
+
+    def __init__(
+        self, robot: RobotModel, states: Mapping[str, float], unmeasured: Collection[str]
+    ) -> None:
+        """Copy the model, and set the state of its data.
+
+        Args:
+            robot: model of the robot.
+            states: positions and velocities by name; others are those of the reference pose.
+            unmeasured: names of the unmeasured joints.
+        """
+        self.model, self.data = _make_dense_data(robot)
+        addresses: dict[str, int] = {}
+        dofs: dict[str, int] = {}
+        for joint in robot.joints:
+            positions, velocities = map(list, list_state_units(joint))
+            for vector, names, first in (
+                (self.data.qpos, positions, joint.position),
+                (self.data.qvel, velocities, joint.velocity),
+            ):
+                for k, name in enumerate(names):
+                    vector[first + k] = states.get(name, vector[first + k])
+            if joint.name in unmeasured:
+                addresses |= {name: joint.position + k for k, name in enumerate(positions)}
+                dofs |= {name: joint.velocity + k for k, name in enumerate(velocities)}
+        self.ranges = np.full((2, self.model.nq), [[-np.inf], [np.inf]])
+        for joint in robot.joints:
+            if joint.range is not None and joint.has_one_coordinate:
+                self.ranges[:, joint.position] = joint.range
+        self._names = [*addresses, *dofs]
+        self.addresses = np.array([*addresses.values()], np.intp)
+        self.dofs = np.array([*dofs.values()], np.intp)
+
+    def guide_measured_joints(self) -> None:
+        """Give measured joints a large inertia, so that they keep the velocities that they have.
+
+        Drives, contacts and limits are left out: their forces depend on more than the loops.
+        """
+        import mujoco
+
+        guided = np.setdiff1d(np.arange(self.model.nv), self.dofs)
+        self.model.dof_armature[guided] += GUIDED_INERTIA
+        flags = mujoco.mjtDisableBit
+        for flag in (flags.mjDSBL_CONTACT, flags.mjDSBL_LIMIT, flags.mjDSBL_ACTUATION):
+            self.model.opt.disableflags |= int(flag)
+
+    def get_unmeasured_states(self) -> dict[str, float]:
+        """Return positions and velocities of the unmeasured joints by name."""
+        states = [*self.data.qpos[self.addresses].tolist(), *self.data.qvel[self.dofs].tolist()]
+        return dict(zip(self._names, states, strict=True))
+
+
+def list_joints_placed_by_loops(robot: RobotModel) -> list[Joint]:
+    """Return the floating joints whose pose follows from those of the joints with one coordinate.
+
+    The constraints determine all of its directions in the reference pose but one: a rod with a ball
+    joint at each end may turn about itself, which moves nothing else.
+
+    Args:
+        robot: model of the robot.
+    """
+    import mujoco
+
+    floating = [joint for joint in robot.joints if not joint.has_one_coordinate]
+    if not floating or not robot.compiled.neq:
+        return []
+    model, data = _make_dense_data(robot)
+    mujoco.mj_fwdPosition(model, data)
+    jacobian = _get_equality_jacobian(model, data)
+    placed = []
+    for joint in floating:
+        size = len(list_state_units(joint)[1])
+        columns = jacobian[:, joint.velocity : joint.velocity + size]
+        if np.linalg.matrix_rank(columns) >= size - 1:
+            placed.append(joint)
+    return placed
+
+
+def _make_dense_data(robot: RobotModel) -> tuple[Any, Any]:
+    """Return a copy of the robot's model whose constraints have a dense Jacobian, and its data."""
+    import mujoco
+
+    model = copy.copy(robot.compiled)
+    model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+    return model, mujoco.MjData(model)
+
+
+def _get_equality_jacobian(model: Any, data: Any) -> Array:
+    """Return the Jacobian (constraints, nv) of the equality constraints.
+
+    MuJoCo stores the Jacobian and the residual of all constraints; equality constraints are the
+    first `ne` rows.
 
     Args:
         model: compiled model, whose constraints have a dense Jacobian.
-        data: its state, which is changed.
-        positions: addresses of the unmeasured joints in qpos.
-        velocities: their addresses in qvel, integers.
+        data: its state, after `mj_fwdPosition`.
+    """
+    jacobian: Array = data.efc_J.reshape(-1, model.nv)[: data.ne].copy()
+    return jacobian
+
+
+def _solve_constraints(loops: _LoopModel) -> Array | None:
+    """Move the unmeasured joints until the equality constraints are satisfied.
+
+    Each Gauss-Newton step is q_u <- q_u - J_u^+ r(q) with the residual r of the constraints, their
+    Jacobian J, and its pseudo-inverse for the unmeasured joints u. A step is shortened to
+    `MAX_MOTION`, and joints stay in their ranges.
+
+    Args:
+        loops: the model, whose state is changed.
 
     Returns:
         Jacobian (constraints, nv) of the constraints; None if they cannot be satisfied.
     """
     import mujoco
 
+    model, data, dofs = loops.model, loops.data, loops.dofs
+    step = np.zeros(model.nv)
     for _ in range(MAX_STEPS):
-        # MuJoCo stores J and r of all constraints; equality constraints are the first `ne` rows.
         mujoco.mj_fwdPosition(model, data)
-        jacobian: Array = data.efc_J.reshape(-1, model.nv)[: data.ne].copy()
-        step = -np.linalg.pinv(jacobian[:, velocities]) @ data.efc_pos[: data.ne]
-        if float(np.abs(step).max(initial=0.0)) < POSITION_TOLERANCE:
+        jacobian = _get_equality_jacobian(model, data)
+        step[dofs] = -np.linalg.pinv(jacobian[:, dofs]) @ data.efc_pos[: data.ne]
+        length = float(np.abs(step).max(initial=0.0))
+        if length < POSITION_TOLERANCE:
             return jacobian
-        data.qpos[positions] += step
+        mujoco.mj_integratePos(model, data.qpos, step, min(1.0, MAX_MOTION / length))
+        lowest, highest = loops.ranges[:, loops.addresses]
+        data.qpos[loops.addresses] = np.clip(data.qpos[loops.addresses], lowest, highest)
     return None
 
 

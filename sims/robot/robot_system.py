@@ -16,8 +16,13 @@ from sims.core.system import System, SystemKind
 from sims.robot.contact_pairs import PAIR_SEPARATOR
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.added_elements import find_compile_error, list_added_elements
-from sims.robot.floating_joints import FloatingJoints
-from sims.robot.loop_closure import close_loops, coupled_joints
+from sims.robot.floating_joints import FloatingJoints, list_state_units
+from sims.robot.loop_closure import (
+    close_loops,
+    coupled_joints,
+    list_joints_placed_by_loops,
+    settle_loops,
+)
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.places import placed_effect_classes
 from sims.robot.places.default_excitation import LazyDefaultRecording
@@ -28,7 +33,7 @@ from sims.robot.places.place_list import (
     make_contact_place,
     make_geom_place,
 )
-from sims.robot.robot_model import RobotModel
+from sims.robot.robot_model import Joint, RobotModel
 from sims.robot.state_snapshots import SingleJointSystem, SingleSlideSystem
 
 INTEGRATOR_ACTUATOR_REASON = (
@@ -51,6 +56,7 @@ class RobotSystem(System):
         gears: gear of that servo, by coordinate: its set point per unit of the coordinate.
         activations: names under which a recording may specify initial activations of filters.
         refused_inputs: reason why a recording cannot contain an input, by input.
+        joints_placed_by_loops: floating joints whose pose follows from closed loops.
         traced: compiled effects by inputs (`sims.robot.dynamics.effect_force_program`).
     """
 
@@ -67,6 +73,7 @@ class RobotSystem(System):
     gears: ClassVar[Mapping[int, float]]
     activations: ClassVar[tuple[str, ...]]
     refused_inputs: ClassVar[Mapping[str, str]]
+    joints_placed_by_loops: ClassVar[tuple[Joint, ...]] = ()
     freed_parameters: ClassVar[frozenset[str]] = frozenset()
     freed_effects: ClassVar[tuple[type[Effect], ...]] = ()
     traced: ClassVar[dict[tuple[str, ...], Any]]
@@ -90,16 +97,32 @@ class RobotSystem(System):
     ) -> dict[str, float]:
         """Return states in which the loops of the robot are closed, see `System`.
 
-        Joints in loops that are not measured are placed where the loops put them.
+        Joints in loops that are not measured are placed where the loops put them, also rods with
+        ball joints.
 
         Args:
             states: initial states by name.
             measured: names of the measured positions, such as ``q.crank``.
         """
+        unmeasured = cls.list_unmeasured_joints_of_loops(measured)
+        closed = close_loops(cls.robot, states, unmeasured)
+        return settle_loops(cls.robot, closed, unmeasured)
+
+    @classmethod
+    def list_unmeasured_joints_of_loops(cls, measured: Collection[str]) -> list[str]:
+        """Return the names of joints in closed loops that are not measured, of any kind.
+
+        Args:
+            measured: names of the measured states, such as ``q.crank`` and ``q.rod.qw``.
+        """
         in_loops = sorted(set().union(*cls.loops))
         names = [cls.coordinates[coordinate].removeprefix("q.") for coordinate in in_loops]
         unmeasured = [name for name in names if f"q.{name}" not in measured]
-        return close_loops(cls.robot, states, unmeasured)
+        return unmeasured + [
+            joint.name
+            for joint in cls.joints_placed_by_loops
+            if not any(set(units).intersection(measured) for units in list_state_units(joint))
+        ]
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
@@ -287,6 +310,11 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     states |= {f"qd.{j.name}": 0.0 for j in joints}
     floating = FloatingJoints.from_robot(robot)
     states |= floating.states()
+    floating_state_units = floating.units()
+    placed_joints = list_joints_placed_by_loops(robot)
+    placed_states = {
+        name for joint in placed_joints for units in list_state_units(joint) for name in units
+    }
     actuators_by_coordinate = {
         coordinate: [a for a in robot.actuators if a.joint == joint.name]
         for coordinate, joint in enumerate(joints)
@@ -309,7 +337,11 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         "states": MappingProxyType(states),
         "sensed": tuple(c.name for c in channels),
         "robot": robot,
-        "floating_state_units": MappingProxyType(floating.units()),
+        "floating_state_units": MappingProxyType(floating_state_units),
+        "required_state_units": MappingProxyType(
+            {n: unit for n, unit in floating_state_units.items() if n not in placed_states}
+        ),
+        "joints_placed_by_loops": tuple(placed_joints),
         "base_orientations": MappingProxyType(dict(robot.base_orientations)),
         "loops": tuple(map(frozenset, coupled_joints(model, [j.velocity for j in joints]))),
         "places": list_places(robot, [(c.name, c.unit) for c in channels]),

@@ -75,10 +75,9 @@ def prepare_run(
     guesses = _guess_initial_states(run, simulator)
     fixed = {*run.initial, *_find_unobserved_states(simulator)}
     # Initial values that are not states of the system, such as the pose of a floating base, are not
-    # part of a batch element.
-    other_initial_values = {
-        name: value for name, value in run.initial.items() if name not in states
-    }
+    # part of a batch element. They are stated, or follow from closed loops.
+    other_names = {*run.initial, *simulator.system.floating_state_units}.difference(states)
+    other_initial_values = {name: guesses[name] for name in sorted(other_names)}
     return RunData(
         name=run.name,
         scenario=Scenario(

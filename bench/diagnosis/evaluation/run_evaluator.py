@@ -538,6 +538,7 @@ class RunEvaluator:
         evaluator = self._copy(kind, self.runs)
         evaluator.filtered_runs = self.filtered_runs
         evaluator.initial_state_guesses = self.initial_state_guesses
+        evaluator.prepared_runs = self.prepared_runs
         evaluator.state_derivatives = self.state_derivatives
         evaluator.identified = self.identified
         evaluator.state_prior = self.state_prior
@@ -744,8 +745,35 @@ class RunEvaluator:
         self.initial_state_guesses = np.where(
             self.known_state_mask | ~is_finite, self.initial_state_guesses, initial_states
         )
+        self._close_loops()
         self.state_derivatives = filtered_runs.compute_state_sensitivities()
         self.state_prior = filtered_runs.get_state_prior()
+
+    def _close_loops(self) -> None:
+        """Place unmeasured joints of loops with floating joints where the constraints put them.
+
+        The initial states of floating joints are not fitted, so they have to be consistent with the
+        estimated velocities of the other joints.
+        """
+        system = self.simulator.system
+        if system.floating_state_units.keys() == system.required_state_units.keys():
+            return
+        prepared_runs = []
+        guesses = self.initial_state_guesses.copy()
+        for guess, run, prepared in zip(guesses, self.runs, self.prepared_runs, strict=True):
+            scenario = prepared.scenario
+            states = {
+                **scenario.initial,
+                **dict(zip(self.state_names, guess.tolist(), strict=True)),
+            }
+            closed = system.close_loops(states, {*run.channels, *run.initial})
+            guess[:] = [closed[name] for name in self.state_names]
+            initial = {name: closed[name] for name in scenario.initial}
+            scenario = replace(scenario, initial=initial)
+            prepared_runs.append(replace(prepared, scenario=scenario))
+        self.initial_state_guesses, self.prepared_runs = guesses, tuple(prepared_runs)
+        self._shortened_scenarios.clear()
+        self.worker_pool.forget(self)
 
     def begin_at(self, states: Array, deviations: Array) -> None:
         """Use estimated initial states of a robot in contact, from a nonlinear filter.

@@ -55,7 +55,7 @@ def make_segment_evaluator(evaluator: RunEvaluator) -> RunEvaluator | None:
         The segments as runs, or None if every run is too short for two segments, or if the system
         has a floating base or bounces.
     """
-    if evaluator.simulator.system.bounces or evaluator.simulator.system.floating_state_units:
+    if evaluator.simulator.system.bounces or evaluator.simulator.system.required_state_units:
         return None
     runs = [segment for run in evaluator.runs for segment in _split_run(run)]
     if len(runs) == len(evaluator.runs):

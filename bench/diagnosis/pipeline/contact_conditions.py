@@ -59,7 +59,7 @@ class ContactConditions:
         Those of a robot on the ground are short already.
         """
         kind: Any = self.kind
-        has_unknown_states = kind.has_model and bool(kind.system.floating_state_units)
+        has_unknown_states = kind.has_model and bool(kind.system.required_state_units)
         return kind.has_model and not has_unknown_states and not self.is_on_ground
 
     def get_segment_duration(self, options: ExplainOptions) -> float | None:

@@ -41,12 +41,18 @@ EFFECTS_AT_SEVERAL_JOINTS = frozenset({"joint.axis", "joint.coupling", "joint.ze
 def get_joint_name(evaluator: RunEvaluator, joint: int) -> str:
     """Return the name of a joint, that of its coordinate ``q.NAME`` without the prefix.
 
+    After the joints with one coordinate, the filter has the directions in which floating joints
+    move, such as ``base.wx``. No effect has such a place.
+
     Args:
         evaluator: the runs.
-        joint: index of the joint.
+        joint: index of the joint, or of the direction after the joints.
     """
-    coordinate: str = evaluator.simulator.system.coordinates[joint]
-    return coordinate.removeprefix("q.")
+    system = evaluator.simulator.system
+    if joint < len(system.coordinates):
+        return str(system.coordinates[joint]).removeprefix("q.")
+    directions = [name for name in system.floating_state_units if name.startswith("qd.")]
+    return directions[joint - len(system.coordinates)].removeprefix("qd.")
 
 
 def get_servo_input(evaluator: RunEvaluator, joint: int) -> str:

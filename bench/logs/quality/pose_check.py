@@ -15,7 +15,7 @@ import numpy as np
 from bench.logs.quality.quality_finding import Anomaly, QualityFinding
 from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run
-from sims.recording.recording_description import get_floating_state_units
+from sims.recording.recording_description import get_required_state_units
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 
 CHECKED_INSTANTS = 100
@@ -247,8 +247,8 @@ def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iter
     """Find floating joints whose initial state is missing in some run.
 
     No sensor of a usual log shows where a free body begins, and the fit does not estimate it, so
-    the description must state it, at least in part. Only the first run without any state of the
-    joint is reported.
+    the description must state it, at least in part, unless closed loops determine it. Only the
+    first run without any state of the joint is reported.
 
     Args:
         recording: Recording to check.
@@ -258,7 +258,7 @@ def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iter
         One certain anomaly for each such joint.
     """
     states_by_joint: dict[str, list[str]] = {}
-    for name in get_floating_state_units(kind):
+    for name in get_required_state_units(kind):
         # The name of a state is that of its quantity, joint and coordinate: q.hull.x.
         joint = name.split(".", 1)[1].rpartition(".")[0]
         states_by_joint.setdefault(joint, []).append(name)

@@ -46,7 +46,8 @@ from sims.robot.dynamics.linearisation_points import (
 from sims.robot.dynamics.midpoint_state import IndexArray, forces_are_at_step_end
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.dynamics.tangent_propagation import Perturbation
-from sims.robot.floating_joints import FloatingState
+from sims.robot.floating_joints import FloatingJoints, FloatingState
+from sims.robot.loop_closure import follow_measured_joints
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_simulator import RobotSimulator
 from sims.system_simulator import SystemSimulator
@@ -221,6 +222,8 @@ class MeasuredLinear(RunLinearisation):
     def _interpolate_samples(self, motion: RobotMotion) -> Trajectory:
         """Interpolate the measured joints between samples by quintic Hermite polynomials.
 
+        Unmeasured joints of closed loops follow them.
+
         Args:
             motion: simulated motion, which all other joints and the floating base keep.
 
@@ -236,7 +239,40 @@ class MeasuredLinear(RunLinearisation):
         for joint, samples in self._measured.items():
             x[:, joint], v[:, joint] = interpolate_quintic(self._times, samples, step_times)
         joints = len(self._simulator.addresses.positions)
-        return Trajectory(x[:, :joints], v[:, :joints], motion.floating_state)
+        trajectory = Trajectory(x[:, :joints], v[:, :joints], motion.floating_state)
+        return self._close_loops(trajectory) if self._measured else trajectory
+
+    def _close_loops(self, trajectory: Trajectory) -> Trajectory:
+        """Move unmeasured joints of closed loops as the measured joints make them.
+
+        Args:
+            trajectory: motion of the measured joints, and simulated motion of the others.
+
+        Returns:
+            The motion with closed loops; the given one if nothing is unmeasured in a loop.
+        """
+        system, robot = self._simulator.system, self._simulator.robot
+        measured = {system.coordinates[joint] for joint in self._measured}
+        unmeasured = system.list_unmeasured_joints_of_loops(measured)
+        if not unmeasured:
+            return trajectory
+        model, addresses = robot.compiled, self._simulator.addresses
+        floating = FloatingJoints.from_robot(robot)
+        positions = np.tile(model.qpos0, (len(trajectory.x), 1))
+        velocities = np.zeros((len(trajectory.x), model.nv))
+        positions[:, addresses.positions] = trajectory.x
+        velocities[:, addresses.velocities] = trajectory.v
+        positions[:, floating.positions] = trajectory.floating_state.pose
+        velocities[:, floating.velocities] = trajectory.floating_state.rate
+        step = self._simulator.time_step
+        positions, velocities = follow_measured_joints(
+            robot, step, positions, velocities, unmeasured
+        )
+        return Trajectory(
+            positions[:, addresses.positions],
+            velocities[:, addresses.velocities],
+            FloatingState(positions[:, floating.positions], velocities[:, floating.velocities]),
+        )
 
     # -- the model from sample to sample
 

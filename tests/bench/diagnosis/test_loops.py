@@ -1,4 +1,8 @@
-"""Tests of recordings of a leg whose knee is driven by a rod, with unmeasured joints."""
+"""Tests of recordings of a leg whose knee is driven by a rod, with unmeasured joints.
+
+The rod is in the plane of the leg with a hinge at its end, or next to it with a ball joint at each
+end, as in legs with springs; nothing measures its pose.
+"""
 
 import mujoco
 import numpy as np
@@ -36,14 +40,20 @@ LEG = """<mujoco model="leg">
   </actuator>
 </mujoco>
 """
+HINGE = """<joint name="rod" axis="0 1 0" damping="0.001"/>
+          <geom fromto="0 0 0 0 0 -0.35" size="0.006" mass="0.15"/>"""
+BALL = """<joint name="rod" type="ball" damping="0.001"/>
+          <geom fromto="0 0 0 0 0.04 -0.35" size="0.006" mass="0.15"/>"""
+assert HINGE in LEG
+BALL_LEG = LEG.replace(HINGE, BALL).replace('anchor="0 0 -0.35"', 'anchor="0 0.04 -0.35"')
 NOISE = 3e-4
 """Standard deviation of the encoders in rad."""
 
 
-def write_leg_log(folder, planted_damping):
+def write_leg_log(folder, planted_damping, leg):
     """Write three runs of 3 s by plain MuJoCo; the encoders are at hip and crank alone."""
     rng, runs, times = np.random.default_rng(5), [], np.arange(301) / 100
-    model = mujoco.MjModel.from_xml_string(LEG)
+    model = mujoco.MjModel.from_xml_string(leg)
     model.dof_damping[model.joint("knee").dofadr[0]] += planted_damping
     encoders = [model.joint(joint).qposadr[0] for joint in ("hip", "crank")]
     for _ in range(3):
@@ -55,17 +65,19 @@ def write_leg_log(folder, planted_damping):
         runs.append((times, commands, positions + NOISE * rng.standard_normal(positions.shape)))
     units = dict.fromkeys(("u.m_hip", "u.m_crank", "q.hip", "q.crank"), "rad")
     description = describe(units, NOISE, "[runs.3]\nheld_out = true\n", "leg")
-    return write_log(folder, description, ",".join(units), runs, leg=LEG)
+    return write_log(folder, description, ",".join(units), runs, leg=leg)
 
 
 @pytest.mark.slow
-def test_a_leg_with_a_rod_is_adequate(tmp_path):
-    assert explain(write_leg_log(tmp_path, 0.0), jobs=1).answer.verdict == "adequate"
+@pytest.mark.parametrize("leg", [LEG, BALL_LEG], ids=["hinge", "ball"])
+def test_a_leg_with_a_rod_is_adequate(tmp_path, leg):
+    assert explain(write_leg_log(tmp_path, 0.0, leg), jobs=1).answer.verdict == "adequate"
 
 
 @pytest.mark.slow
-def test_a_damping_in_the_loop_is_found(tmp_path):
-    answer = explain(write_leg_log(tmp_path, 0.5), jobs=1).answer
+@pytest.mark.parametrize("leg", [LEG, BALL_LEG], ids=["hinge", "ball"])
+def test_a_damping_in_the_loop_is_found(tmp_path, leg):
+    answer = explain(write_leg_log(tmp_path, 0.5, leg), jobs=1).answer
     (cause,) = answer.causes
     assert "drag.linear@knee" in (cause.effect, *cause.alternatives)
     if cause.effect == "drag.linear@knee":
