@@ -45,6 +45,7 @@ from bench.diagnosis.prediction_error.single_effect_fits import (
     scale_effect,
 )
 from bench.diagnosis.search.alternative_causes import differ_in_one_effect
+from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.simulator import Array
 
 FURTHER_STEPS = 4
@@ -60,6 +61,8 @@ MAX_REFINED_EXCESS_SHARE = 0.25
 
 It is a share of the excess residual of the base model.
 """
+MAX_SINGLE_LOSS = 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+"""Maximum loss of penalised log-likelihood by one effect in place of several."""
 MIN_SAME_JOINT_GAIN_SHARE = 0.5
 """Minimum gain of an effect at the same joint that is tried as a replacement.
 
@@ -87,9 +90,10 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
 
     Two linear laws may imitate one nonlinear law, and many coefficients of two laws one law with
     few. If a model with several effects explains the runs, or nearly, it is compared with the best
-    single effect and its competitors, and the model with the higher penalised log-likelihood is
-    returned. The single effect comes from the fits of all proposed effects by simulation; if they
-    were not all fitted, from filters. If it is far worse, its competitors are not fitted.
+    single effect and its competitors. That effect replaces it unless its penalised log-likelihood
+    is lower by more than `MAX_SINGLE_LOSS`. It comes from the fits of all proposed effects by
+    simulation; if they were not all fitted, from filters. If it is far worse, its competitors are
+    not fitted.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -123,7 +127,10 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
         if 2.0 * loss > penalty + COMPETING_MODEL_MARGIN:
             return best
         single = fit_filtered(context, single_sets[0])
-    return select_likeliest(fit_competing_models(context, single), best)
+    single = fit_competing_models(context, single)
+    # One cause is simpler than several that act alike, as a tilt and an offset with less gravity.
+    limit = best.penalised_log_likelihood - MAX_SINGLE_LOSS
+    return single if single.penalised_log_likelihood > limit else best
 
 
 def replace_time_shifts(context: SearchContext, best: FittedModel) -> FittedModel:

@@ -130,3 +130,22 @@ def test_one_effect_replaces_two_that_imitate_it(tmp_path):
     log = write_log(tmp_path, description, "q.hinge", runs, arm=PENDULUM)
     (cause,) = explain(log).answer.causes
     assert {cause.effect, *cause.alternatives} == {"gravity.scale", "gravity.compensation@link"}
+
+
+@pytest.mark.parametrize(("loss", "is_replaced"), [(-40.0, True), (0.03, True), (5.0, False)])
+def test_one_effect_that_acts_like_two_is_preferred(monkeypatch, loss, is_replaced):
+    """A tilt of gravity acts like an offset of the first encoder and a gain of gravity."""
+    single = SimpleNamespace(effects=("gravity.tilt",), penalised_log_likelihood=1000.0 - loss)
+    both = ("sensor.bias@q.upper", "gravity.scale")
+    best = SimpleNamespace(effects=both, penalised_log_likelihood=1000.0)
+    monkeypatch.setattr(competing_models, "is_nearly_explained", lambda *_: True)
+    monkeypatch.setattr(competing_models, "has_series", lambda *_: False)
+    monkeypatch.setattr(competing_models, "fit_competing_models", lambda _, model: model)
+    context = SimpleNamespace(
+        search=SimpleNamespace(models={frozenset(single.effects): single}),
+        filters=None,
+        proposals=SimpleNamespace(list_alone=lambda: [single]),
+        evaluator=SimpleNamespace(search_control=SimpleNamespace(is_over=lambda: False)),
+    )
+    chosen = competing_models.fit_single_in_place(context, best)
+    assert chosen is (single if is_replaced else best)
