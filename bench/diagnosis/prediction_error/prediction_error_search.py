@@ -106,6 +106,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     remove_idle_effects,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
+    add_series_effect,
     fit_likely_effects,
     fit_series_effects,
     fit_single_effects,
@@ -299,6 +300,8 @@ class PredictionErrorSearch(EffectSearch):
             if series is None:
                 series = simulate_series_effects(context, selected_with_shapes)
             best = select_likeliest(best, fit_series_effects(context, series))
+        if self._should_continue(best):
+            best = add_series_effect(context, best)
         # The quick fits may have skipped the selection because it is slow to simulate.
         if not best.effects:
             best = fit_selection(context, selected_with_shapes)

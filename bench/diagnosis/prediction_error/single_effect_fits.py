@@ -7,7 +7,7 @@ most likely missing are therefore simulated alone, as one batch: first each at s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from bench.diagnosis.prediction_error.effects_at_joints import (
     SERVO_MODEL,
     SET_POINT_MODEL,
     acts_at_joint,
+    has_series,
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
@@ -40,7 +41,9 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     remove_idle_effects,
     select_lowest_of_each,
 )
+from bench.diagnosis.search.fit_starts import add_effect_to_start
 from sims.core.effect import members_of
+from sims.core.simulator import Array
 from sims.robot.dynamics.series_joints import is_series_effect
 
 SCANNED_FACTORS = (0.5, 2.0, 4.0)
@@ -275,13 +278,55 @@ def simulate_series_effects(context: SearchContext, selected: Selected) -> list[
     """
     evaluator = context.evaluator
     joints = {followed.joints_by_loss[0] for followed in (context.filters.base, selected.followed)}
+    alone = FitStart((), context.filters.reference, evaluator.initial_state_guesses)
+    return _simulate_series_effects(context, alone, joints)
+
+
+def add_series_effect(context: SearchContext, best: FittedModel) -> FittedModel:
+    """Return a model with an elastic joint or backlash in addition, if that is likelier.
+
+    A regression does not find these effects, so that a model with the other cause of a pair is the
+    best one without them.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        best: the best model so far, which does not explain the runs.
+    """
+    if not best.effects or has_series(context.evaluator, best.effects):
+        return best
+    joints = {context.filters.get_filter(best).joints_by_loss[0]}
+    simulated = _simulate_series_effects(context, best.fit.make_start(), joints)
+    added = fit_series_effects(context, simulated, best.fit.cost)
+    if not added.effects:
+        return best
+    return select_likeliest(best, remove_idle_effects(context, added))
+
+
+def _simulate_series_effects(
+    context: SearchContext, start: FitStart, joints: Collection[int]
+) -> list[RatedStart]:
+    """Simulate elasticity and backlash at some joints, in addition to the effects of a model.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        start: the model.
+        joints: indices of the joints.
+
+    Returns:
+        The best start of each effect.
+    """
+    evaluator = context.evaluator
     names = [
         name
         for name in evaluator.library
         if is_series_effect(evaluator.available_effects[name])
         and acts_at_joint(evaluator, name, joints)
     ]
-    starts = [start for name in names for start in _list_series_starts(context, name)]
+    starts = [
+        add_effect_to_start(evaluator, start, name, coefficients)
+        for name in names
+        for coefficients in _list_series_coefficients(context, name)
+    ]
     if not starts:
         return []
     evaluator.search_control.begin_stage(
@@ -314,8 +359,8 @@ def fit_series_effects(
     return fit_by_simulation(context, select_likeliest(*search.fit_all(starts)).fit.make_start())
 
 
-def _list_series_starts(context: SearchContext, name: str) -> list[FitStart]:
-    """Return starts with the trial coefficients of an effect between a drive and its link.
+def _list_series_coefficients(context: SearchContext, name: str) -> list[Array]:
+    """Return the trial coefficients (k,) of an effect between a drive and its link.
 
     A fit from a much larger gap than the true one ends in a local minimum, so that shares of the
     smallest trial coefficient are added to the probes.
@@ -330,8 +375,4 @@ def _list_series_starts(context: SearchContext, name: str) -> list[FitStart]:
         smaller = smallest.copy()
         smaller[0] *= share
         probes.append(smaller)
-    states = context.evaluator.initial_state_guesses
-    return [
-        FitStart((name,), context.filters.make_theta_with(name, coefficients), states)
-        for coefficients in probes
-    ]
+    return probes

@@ -11,6 +11,7 @@ from bench.diagnosis.prediction_error.regression_columns import list_probes
 from bench.diagnosis.prediction_error.simulated_fits import RatedStart, compute_likely_cost
 from bench.diagnosis.prediction_error.single_effect_fits import (
     SMALLER_SERIES_SHARES,
+    add_series_effect,
     fit_series_effects,
     simulate_series_effects,
 )
@@ -25,16 +26,10 @@ def simulated(example_arm, monkeypatch):
     The wrong selection has moved the largest missing force from the first to the second joint.
     """
     monkeypatch.setattr(single_effect_fits, "select_lowest_of_each", lambda _, starts: starts)
-
-    def make_theta_with(name, coefficients):
-        theta = example_arm.get_nominal_theta()
-        theta[example_arm.coefficient_slices[name]] = coefficients
-        return theta
-
     context = SimpleNamespace(
         evaluator=example_arm,
         filters=SimpleNamespace(
-            base=SimpleNamespace(joints_by_loss=[0, 1]), make_theta_with=make_theta_with
+            base=SimpleNamespace(joints_by_loss=[0, 1]), reference=example_arm.get_nominal_theta()
         ),
         columns=SimpleNamespace(probes=lambda names: list_probes(example_arm, (), names)),
     )
@@ -110,3 +105,43 @@ def test_early_only_effects_that_remove_most_of_the_residual_are_fitted(
     )
     fit_series_effects(SimpleNamespace(search=search), starts, limit)
     assert fitted == expected
+
+
+@pytest.mark.parametrize("has_series", [False, True])
+def test_a_transmission_is_added_at_the_joint_where_the_best_model_lacks_a_force(
+    example_arm, monkeypatch, has_series
+):
+    """As for an elastic elbow with ripple at the shoulder, which is found first."""
+    monkeypatch.setattr(single_effect_fits, "select_lowest_of_each", lambda _, starts: starts)
+    monkeypatch.setattr(single_effect_fits, "remove_idle_effects", lambda _, model: model)
+    monkeypatch.setattr(single_effect_fits, "select_likeliest", lambda *models: models[-1])
+    theta = example_arm.get_nominal_theta()
+    theta[example_arm.coefficient_slices["friction.coulomb@shoulder"]] = 0.3
+    first = "joint.backlash@elbow" if has_series else "friction.coulomb@shoulder"
+    start = FitStart((first,), theta, example_arm.initial_state_guesses)
+    best = SimpleNamespace(
+        effects=(first,), fit=SimpleNamespace(cost=BASE_COST, make_start=lambda: start)
+    )
+    added = []
+
+    def fit_added(_, simulated, limit):
+        added.extend(simulated)
+        assert limit == BASE_COST
+        return SimpleNamespace(effects=("added",))
+
+    monkeypatch.setattr(single_effect_fits, "fit_series_effects", fit_added)
+    context = SimpleNamespace(
+        evaluator=example_arm,
+        filters=SimpleNamespace(get_filter=lambda _: SimpleNamespace(joints_by_loss=[1, 0])),
+        columns=SimpleNamespace(probes=lambda names: list_probes(example_arm, (), names)),
+    )
+    chosen = add_series_effect(context, best)
+    if has_series:
+        assert (chosen, added) == (best, [])
+        return
+    assert chosen.effects == ("added",)
+    laws = {f"joint.{law}@elbow" for law in ("flexibility", "backlash")}
+    assert {tuple(start.effects) for start in added} == {(first, law) for law in laws}
+    for one in added:
+        assert one.theta[example_arm.coefficient_slices[first]] == 0.3
+        assert one.theta[example_arm.coefficient_slices[one.effects[1]]][0] > 0.0
