@@ -169,6 +169,29 @@ class FollowedRuns:
         assert best is not None
         return best
 
+    def recompute_jacobians(self) -> FollowedRuns:
+        """Return the filter with Jacobians about its own smoothed motion, if that is likelier.
+
+        `follow` takes the Jacobians from the motion of the readings, which saves most of its time.
+        There, the noise reverses the friction of joints that rest or creep, so that the filter of
+        an arm with dry friction may need large missing forces. This is tried only if it has such.
+        """
+        best, smaller_force = self, FIRST_FORCE * self.typical
+        for _ in range(MAX_LINEARISATIONS):
+            if self.is_on_ground or not (best.force > smaller_force).any():
+                break
+            linear = [
+                linearise_run(self.evaluator, self.theta, self.noise, run, motion, None)
+                for run, motion in enumerate(best.trajectories)
+            ]
+            followed = self._filter_linear(
+                self.evaluator, self.theta, best.noise, linear, best.force, self.typical
+            )
+            if not followed.log_likelihood > best.log_likelihood + LINEARISED_GAIN:
+                break
+            best = followed
+        return best
+
     def with_parameters(
         self,
         theta: Array,

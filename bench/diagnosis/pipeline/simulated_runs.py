@@ -196,7 +196,8 @@ class SimulatedRuns:
         # This import is needed for robots only.
         from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
-        return FollowedRuns.follow(self.fitting, self.fitting.get_nominal_theta(), self.noise)
+        followed = FollowedRuns.follow(self.fitting, self.fitting.get_nominal_theta(), self.noise)
+        return followed.recompute_jacobians()
 
     @property
     def predicted(self) -> RunEvaluator | None:

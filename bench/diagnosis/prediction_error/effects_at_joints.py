@@ -8,8 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
+import numpy as np
+
+from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from sims.core.effect import Effect, members_of
+from sims.core.simulator import Array
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.loop_closure import coupled_joints
 from sims.robot.robot_simulator import RobotSimulator
@@ -197,6 +201,48 @@ def list_moved_bodies(evaluator: RunEvaluator) -> list[str]:
     assert isinstance(evaluator.simulator, RobotSimulator)
     model = evaluator.simulator.robot.compiled
     return [model.body(b).name for b in model.dof_bodyid[evaluator.simulator.addresses.velocities]]
+
+
+def list_equal_inertias(
+    evaluator: RunEvaluator, name: str, coefficients: Array
+) -> list[tuple[str, Array]]:
+    """Return the armature that acts about a joint like a link's inertia, or the reverse.
+
+    The moment of inertia of a link with principal moments I, about an axis a through its centre of
+    mass, is sum(I_k a_k^2) in the principal frame. Both act alike if nothing else turns the link.
+    The response to a large inertia is far from linear, so that a regression may miss one of them.
+
+    Args:
+        evaluator: the runs.
+        name: name of the effect, such as ``inertia.armature@elbow`` or ``inertia.scale@forearm``.
+        coefficients: (1,) armature in kg·m², or relative change of the link's inertia.
+
+    Returns:
+        Name and coefficient (1,) of the other effect; empty for any other effect.
+    """
+    simulator = evaluator.simulator
+    is_inertia = name.startswith(("inertia.armature@", "inertia.scale@"))
+    if not is_inertia or not isinstance(simulator, RobotSimulator):
+        return []
+    # This import is needed for robots only.
+    import mujoco
+
+    model = simulator.robot.compiled
+    equal = []
+    for joint, body in enumerate(list_moved_bodies(evaluator)):
+        armature = f"inertia.armature@{get_joint_name(evaluator, joint)}"
+        scale = f"inertia.scale@{body}"
+        number = simulator.robot.file_joints[joint].id
+        if name not in (armature, scale) or model.jnt_type[number] != mujoco.mjtJoint.mjJNT_HINGE:
+            continue
+        link, axis = model.body(body), np.empty(3)
+        mujoco.mju_rotVecQuat(axis, model.jnt_axis[number], link.iquat * [1.0, -1.0, -1.0, -1.0])
+        moment = float(link.inertia @ axis**2)
+        other, factor = (scale, 1.0 / moment) if name == armature else (armature, moment)
+        if other in evaluator.coefficient_slices:
+            ((low, high),) = compute_coefficient_bounds(evaluator, other)
+            equal.append((other, np.clip(coefficients * factor, low, high)))
+    return equal
 
 
 def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
