@@ -33,7 +33,7 @@ from sims.robot.places.place_list import (
     make_contact_place,
     make_geom_place,
 )
-from sims.robot.robot_model import Joint, RobotModel
+from sims.robot.robot_model import RobotModel
 from sims.robot.state_snapshots import SingleJointSystem, SingleSlideSystem
 
 INTEGRATOR_ACTUATOR_REASON = (
@@ -56,7 +56,8 @@ class RobotSystem(System):
         gears: gear of that servo, by coordinate: its set point per unit of the coordinate.
         activations: names under which a recording may specify initial activations of filters.
         refused_inputs: reason why a recording cannot contain an input, by input.
-        joints_placed_by_loops: floating joints whose pose follows from closed loops.
+        joint_loops: names of the joints of each closed loop; of floating joints only those whose
+            pose follows from the loop.
         traced: compiled effects by inputs (`sims.robot.dynamics.effect_force_program`).
     """
 
@@ -73,7 +74,7 @@ class RobotSystem(System):
     gears: ClassVar[Mapping[int, float]]
     activations: ClassVar[tuple[str, ...]]
     refused_inputs: ClassVar[Mapping[str, str]]
-    joints_placed_by_loops: ClassVar[tuple[Joint, ...]] = ()
+    joint_loops: ClassVar[tuple[frozenset[str], ...]] = ()
     freed_parameters: ClassVar[frozenset[str]] = frozenset()
     freed_effects: ClassVar[tuple[type[Effect], ...]] = ()
     traced: ClassVar[dict[tuple[str, ...], Any]]
@@ -104,24 +105,45 @@ class RobotSystem(System):
             states: initial states by name.
             measured: names of the measured positions, such as ``q.crank``.
         """
-        unmeasured = cls.list_unmeasured_joints_of_loops(measured)
+        unmeasured = [
+            name for loop in cls.joint_loops for name in cls._list_unmeasured(loop, measured)
+        ]
         closed = close_loops(cls.robot, states, unmeasured)
-        return settle_loops(cls.robot, closed, unmeasured)
+        return settle_loops(cls.robot, closed, cls.list_following_joints(measured))
 
     @classmethod
-    def list_unmeasured_joints_of_loops(cls, measured: Collection[str]) -> list[str]:
-        """Return the names of joints in closed loops that are not measured, of any kind.
+    def list_following_joints(cls, measured: Collection[str]) -> list[str]:
+        """Return the names of unmeasured joints that the measured ones of their loop move.
+
+        A loop without a measured joint moves by its drives, and one with a drive at an unmeasured
+        joint by both.
 
         Args:
             measured: names of the measured states, such as ``q.crank`` and ``q.rod.qw``.
         """
-        in_loops = sorted(set().union(*cls.loops))
-        names = [cls.coordinates[coordinate].removeprefix("q.") for coordinate in in_loops]
-        unmeasured = [name for name in names if f"q.{name}" not in measured]
-        return unmeasured + [
-            joint.name
-            for joint in cls.joints_placed_by_loops
-            if not any(set(units).intersection(measured) for units in list_state_units(joint))
+        driven = {joint for a in cls.robot.actuators for joint in (a.joint, *a.moves)}
+        following = list[str]()
+        for loop in cls.joint_loops:
+            unmeasured = cls._list_unmeasured(loop, measured)
+            if len(unmeasured) < len(loop) and driven.isdisjoint(unmeasured):
+                following += unmeasured
+        return following
+
+    @classmethod
+    def _list_unmeasured(cls, joints: Collection[str], measured: Collection[str]) -> list[str]:
+        """Return the names of those joints of a loop that are not measured, sorted.
+
+        Args:
+            joints: names of the joints, of any kind.
+            measured: names of the measured states.
+        """
+        return [
+            name
+            for name in sorted(joints)
+            if not any(
+                set(units).intersection(measured)
+                for units in list_state_units(cls.robot.joint(name))
+            )
         ]
 
     @classmethod
@@ -312,6 +334,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     states |= floating.states()
     floating_state_units = floating.units()
     placed_joints = list_joints_placed_by_loops(robot)
+    loop_joints = [*joints, *placed_joints]
     placed_states = {
         name for joint in placed_joints for units in list_state_units(joint) for name in units
     }
@@ -341,7 +364,10 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         "required_state_units": MappingProxyType(
             {n: unit for n, unit in floating_state_units.items() if n not in placed_states}
         ),
-        "joints_placed_by_loops": tuple(placed_joints),
+        "joint_loops": tuple(
+            frozenset(loop_joints[k].name for k in group)
+            for group in coupled_joints(model, [j.velocity for j in loop_joints])
+        ),
         "base_orientations": MappingProxyType(dict(robot.base_orientations)),
         "loops": tuple(map(frozenset, coupled_joints(model, [j.velocity for j in joints]))),
         "places": list_places(robot, [(c.name, c.unit) for c in channels]),

@@ -249,12 +249,12 @@ class MeasuredLinear(RunLinearisation):
             trajectory: motion of the measured joints, and simulated motion of the others.
 
         Returns:
-            The motion with closed loops; the given one if nothing is unmeasured in a loop.
+            The motion with closed loops; the given one if no joint follows measured ones.
         """
         system, robot = self._simulator.system, self._simulator.robot
         measured = {system.coordinates[joint] for joint in self._measured}
-        unmeasured = system.list_unmeasured_joints_of_loops(measured)
-        if not unmeasured:
+        following = system.list_following_joints(measured)
+        if not following:
             return trajectory
         model, addresses = robot.compiled, self._simulator.addresses
         floating = FloatingJoints.from_robot(robot)
@@ -266,7 +266,7 @@ class MeasuredLinear(RunLinearisation):
         velocities[:, floating.velocities] = trajectory.floating_state.rate
         step = self._simulator.time_step
         positions, velocities = follow_measured_joints(
-            robot, step, positions, velocities, unmeasured
+            robot, step, positions, velocities, following
         )
         return Trajectory(
             positions[:, addresses.positions],

@@ -12,6 +12,7 @@ from sims.robot.loop_closure import (
     settle_loops,
 )
 from sims.robot.parsing.read_model_file import read_robot
+from sims.robot.robot_system import make_robot_system
 
 SLIDER_CRANK = """<mujoco>
   <compiler angle="radian"/>
@@ -155,6 +156,22 @@ def test_unmeasured_joints_follow_a_measured_motion_that_the_model_would_not_mak
     assert np.abs(followed[:, 1] - (turned - angle)).max() < 0.02
     assert np.abs(followed[:, 2] - piston).max() < 2e-3
     assert rates[:, 3] == pytest.approx(velocities[:, 3], abs=0.0)
+
+
+@pytest.mark.parametrize(
+    ("driven", "measured", "following"),
+    [
+        ("crank", ["q.crank"], ["piston", "rod"]),
+        ("crank", ["q.piston", "qd.rod", "q.arm"], []),
+        ("rod", ["q.crank"], []),
+        ("rod", ["q.crank", "q.rod"], ["piston"]),
+        ("arm", ["q.arm"], []),
+    ],
+)
+def test_joints_follow_measured_ones_unless_a_drive_moves_them(write, driven, measured, following):
+    actuator = f'<actuator><motor name="m" joint="{driven}"/></actuator></mujoco>'
+    robot = read_robot(write(SLIDER_CRANK.replace("</mujoco>", actuator)))
+    assert make_robot_system(robot).list_following_joints(measured) == following
 
 
 def test_a_loop_that_cannot_close_keeps_its_states(write):
