@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Mapping, Sequence
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -71,10 +72,10 @@ def close_loops(
     mujoco.mj_differentiatePos(model, change, 1.0, reference, data.qpos)
     change[dofs] = 0.0
     data.qpos[:] = reference
-    count = 1 + int(np.abs(change).max(initial=0.0) / MAX_MOTION)
+    poses = 1 + int(np.abs(change).max(initial=0.0) / MAX_MOTION)
     jacobian: Array | None = None
-    for _ in range(count):
-        mujoco.mj_integratePos(model, data.qpos, change, 1.0 / count)
+    for _ in range(poses):
+        mujoco.mj_integratePos(model, data.qpos, change, 1.0 / poses)
         jacobian = _solve_constraints(loops)
     if jacobian is None:
         return dict(states)
@@ -176,19 +177,18 @@ class _LoopModel:
         self.model, self.data = _make_dense_data(robot)
         addresses: dict[str, int] = {}
         dofs: dict[str, int] = {}
-        for joint in robot.joints:
-            positions, velocities = map(list, list_state_units(joint))
-            for vector, names, first in (
-                (self.data.qpos, positions, joint.position),
-                (self.data.qvel, velocities, joint.velocity),
-            ):
-                for k, name in enumerate(names):
-                    vector[first + k] = states.get(name, vector[first + k])
-            if joint.name in unmeasured:
-                addresses |= {name: joint.position + k for k, name in enumerate(positions)}
-                dofs |= {name: joint.velocity + k for k, name in enumerate(velocities)}
         self.ranges = np.full((2, self.model.nq), [[-np.inf], [np.inf]])
         for joint in robot.joints:
+            positions, velocities = list_state_units(joint)
+            joint_addresses = dict(zip(positions, count(joint.position), strict=False))
+            joint_dofs = dict(zip(velocities, count(joint.velocity), strict=False))
+            for name in states.keys() & joint_addresses.keys():
+                self.data.qpos[joint_addresses[name]] = states[name]
+            for name in states.keys() & joint_dofs.keys():
+                self.data.qvel[joint_dofs[name]] = states[name]
+            if joint.name in unmeasured:
+                addresses |= joint_addresses
+                dofs |= joint_dofs
             if joint.range is not None and joint.has_one_coordinate:
                 self.ranges[:, joint.position] = joint.range
         self._names = [*addresses, *dofs]

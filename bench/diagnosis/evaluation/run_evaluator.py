@@ -762,10 +762,8 @@ class RunEvaluator:
         guesses = self.initial_state_guesses.copy()
         for guess, run, prepared in zip(guesses, self.runs, self.prepared_runs, strict=True):
             scenario = prepared.scenario
-            states = {
-                **scenario.initial,
-                **dict(zip(self.state_names, guess.tolist(), strict=True)),
-            }
+            states = dict(scenario.initial)
+            states.update(zip(self.state_names, guess.tolist(), strict=True))
             closed = system.close_loops(states, {*run.channels, *run.initial})
             guess[:] = [closed[name] for name in self.state_names]
             initial = {name: closed[name] for name in scenario.initial}

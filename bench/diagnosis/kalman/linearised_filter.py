@@ -176,9 +176,11 @@ class FollowedRuns:
         There, the noise reverses the friction of joints that rest or creep, so that the filter of
         an arm with dry friction may need large missing forces. This is tried only if it has such.
         """
-        best, smaller_force = self, FIRST_FORCE * self.typical
+        best, negligible_force = self, FIRST_FORCE * self.typical
+        if self.is_on_ground:
+            return self
         for _ in range(MAX_LINEARISATIONS):
-            if self.is_on_ground or not (best.force > smaller_force).any():
+            if not (best.force > negligible_force).any():
                 break
             linear = [
                 linearise_run(self.evaluator, self.theta, self.noise, run, motion, None)

@@ -20,8 +20,8 @@ from bench.diagnosis.prediction_error.effects_at_joints import (
     has_series,
     is_time_shift,
     list_at_coupled_joints,
-    list_equal_inertias,
     list_joint_model_effects,
+    list_similar_inertias,
     list_similar_shifts,
 )
 from bench.diagnosis.prediction_error.filters_with_effects import (
@@ -506,7 +506,7 @@ def _fit_at_related_places(context: SearchContext, size: int) -> None:
     """Fit the best models of a size with effects moved to places where they may act alike.
 
     Joints of a closed loop move together, so the data may not show at which of them an effect acts.
-    The same holds for a payload and the bodies of a joint, and for inertia and armature. The fitted
+    The same holds for a payload and the bodies of a joint, and for masses and inertias. The fitted
     models are added to `search.models`.
 
     Args:
@@ -520,7 +520,7 @@ def _fit_at_related_places(context: SearchContext, size: int) -> None:
             coefficients = model.fit.theta[evaluator.coefficient_slices[name]]
             moved = [(other, coefficients) for other in list_at_coupled_joints(evaluator, name)]
             moved += list_moved_payloads(evaluator, name, coefficients)
-            moved += list_equal_inertias(evaluator, name, coefficients)
+            moved += list_similar_inertias(evaluator, name, coefficients)
             for other, other_coefficients in moved:
                 start = make_replacing_start(evaluator, model, [name], other, other_coefficients)
                 key = frozenset(start.effects)

@@ -15,7 +15,7 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
 from sims.robot.dynamics.series_joints import is_series_effect
-from sims.robot.loop_closure import coupled_joints
+from sims.robot.inertia_tensors import compute_inertia_tensors
 from sims.robot.robot_simulator import RobotSimulator
 
 JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")
@@ -111,18 +111,11 @@ def get_only_joint(evaluator: RunEvaluator, name: str) -> int | None:
         or member.hook == "sensor"
         or member.of in EFFECTS_AT_SEVERAL_JOINTS
         or is_series_effect(member)
-        or any(member.coordinate in group for group in _list_coupled_joints(evaluator))
+        or any(member.coordinate in group for group in evaluator.simulator.system.loops)
     ):
         return None
     joint: int = member.coordinate
     return joint
-
-
-def _list_coupled_joints(evaluator: RunEvaluator) -> list[set[int]]:
-    """Return the groups of joints of a robot that constraints of its model couple."""
-    assert isinstance(evaluator.simulator, RobotSimulator)
-    velocities = evaluator.simulator.addresses.velocities.tolist()
-    return coupled_joints(evaluator.simulator.make_linearisation_batch().model, velocities)
 
 
 def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
@@ -203,46 +196,49 @@ def list_moved_bodies(evaluator: RunEvaluator) -> list[str]:
     return [model.body(b).name for b in model.dof_bodyid[evaluator.simulator.addresses.velocities]]
 
 
-def list_equal_inertias(
+def list_similar_inertias(
     evaluator: RunEvaluator, name: str, coefficients: Array
 ) -> list[tuple[str, Array]]:
-    """Return the armature that acts about a joint like a link's inertia, or the reverse.
+    """Return the effects on mass and inertia that may act like the given one.
 
-    The moment of inertia of a link with principal moments I, about an axis a through its centre of
-    mass, is sum(I_k a_k^2) in the principal frame. Both act alike if nothing else turns the link.
-    The response to a large inertia is far from linear, so that a regression may miss one of them.
+    - The armature of a joint may act like the inertia of the link that it moves, and the reverse,
+      if nothing else turns the link. The moment of inertia about the axis a is a' I a, with the
+      tensor I about the centre of mass.
+    - A payload near the centre of mass of a body acts like a heavier body.
+
+    The response to a large inertia or to the place of a payload is far from linear, so that a
+    regression may miss these effects.
 
     Args:
         evaluator: the runs.
-        name: name of the effect, such as ``inertia.armature@elbow`` or ``inertia.scale@forearm``.
-        coefficients: (1,) armature in kg·m², or relative change of the link's inertia.
+        name: name of the effect, such as ``inertia.armature@elbow`` or ``payload@forearm``.
+        coefficients: (k,) its coefficients; the first is an armature in kg·m², a relative change of
+            the link's inertia, or the mass of the payload in kg.
 
     Returns:
-        Name and coefficient (1,) of the other effect; empty for any other effect.
+        Names and coefficients (1,) of effects in the evaluator; empty for any other effect.
     """
     simulator = evaluator.simulator
-    is_inertia = name.startswith(("inertia.armature@", "inertia.scale@"))
-    if not is_inertia or not isinstance(simulator, RobotSimulator):
+    if not isinstance(simulator, RobotSimulator):
         return []
-    # This import is needed for robots only.
-    import mujoco
-
-    model = simulator.robot.compiled
-    equal = []
-    for joint, body in enumerate(list_moved_bodies(evaluator)):
-        armature = f"inertia.armature@{get_joint_name(evaluator, joint)}"
-        scale = f"inertia.scale@{body}"
-        number = simulator.robot.file_joints[joint].id
-        if name not in (armature, scale) or model.jnt_type[number] != mujoco.mjtJoint.mjJNT_HINGE:
+    law, _, place = name.partition("@")
+    model, similar = simulator.robot.compiled, list[tuple[str, Array]]()
+    if law == "payload":
+        masses = {body.name: float(model.body_mass[body.id]) for body in simulator.robot.bodies}
+        if masses.get(place, 0.0) > 0.0:
+            similar.append((f"mass.scale@{place}", coefficients[:1] / masses[place]))
+    for joint, body in zip(simulator.robot.file_joints, list_moved_bodies(evaluator), strict=True):
+        armature, scale = f"inertia.armature@{joint.name}", f"inertia.scale@{body}"
+        if name not in (armature, scale) or joint.kind != "hinge":
             continue
-        link, axis = model.body(body), np.empty(3)
-        mujoco.mju_rotVecQuat(axis, model.jnt_axis[number], link.iquat * [1.0, -1.0, -1.0, -1.0])
-        moment = float(link.inertia @ axis**2)
+        link, axis = model.body(body), model.jnt_axis[joint.id]
+        (tensor,) = compute_inertia_tensors(link.iquat[None], link.inertia[None])
+        moment = float(axis @ tensor @ axis)
         other, factor = (scale, 1.0 / moment) if name == armature else (armature, moment)
-        if other in evaluator.coefficient_slices:
-            ((low, high),) = compute_coefficient_bounds(evaluator, other)
-            equal.append((other, np.clip(coefficients * factor, low, high)))
-    return equal
+        similar.append((other, coefficients * factor))
+    known = [(other, c) for other, c in similar if other in evaluator.coefficient_slices]
+    bounds = [np.array(compute_coefficient_bounds(evaluator, other)).T for other, _ in known]
+    return [(other, np.clip(c, *ends)) for (other, c), ends in zip(known, bounds, strict=True)]
 
 
 def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
@@ -263,7 +259,7 @@ def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     joints = {get_joint_name(evaluator, joint): joint for joint in range(count)}
     if place not in joints:
         return []
-    groups = _list_coupled_joints(evaluator)
+    groups = evaluator.simulator.system.loops
     others = {joint for group in groups if joints[place] in group for joint in group}
     names = [
         f"{law}@{get_joint_name(evaluator, joint)}" for joint in sorted(others - {joints[place]})

@@ -1,9 +1,8 @@
-"""Move a payload to a neighbouring body, or add its mass to its own body.
+"""Move a payload to a neighbouring body.
 
 A point mass near the axis of a joint, or at a joint that hardly moves, acts nearly alike on both
-bodies of the joint, and one near the centre of mass of a body like a heavier body. The response to
-a payload is not linear in its place, so a regression far from the right place does not show this;
-the moved payload does.
+bodies of the joint. The response to a payload is not linear in its place, so a regression far from
+the right place does not show this; the moved payload does.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from sims.robot.robot_simulator import RobotSimulator
 def list_moved_payloads(
     evaluator: RunEvaluator, name: str, coefficients: Array
 ) -> list[tuple[str, Array]]:
-    """Return a payload moved to the bodies that joints connect with its body, and as their mass.
+    """Return a payload moved to the bodies that joints connect with its body.
 
     The payload stays where it is in space in the mean pose in which the runs begin; its position is
-    clipped to the bounds of the other body. A heavier body has the same additional mass.
+    clipped to the bounds of the other body.
 
     Args:
         evaluator: the runs.
@@ -31,8 +30,7 @@ def list_moved_payloads(
             frame.
 
     Returns:
-        Names and coefficients of effects in the evaluator: payloads (4,), and the relative change
-        (1,) of the mass of the same body; empty for any other effect.
+        Names and coefficients (4,) of payloads in the evaluator; empty for any other effect.
     """
     law, _, place = name.partition("@")
     simulator = evaluator.simulator
@@ -56,9 +54,6 @@ def list_moved_payloads(
     # Parent of each body. A body without joints moves with the body to which it is welded.
     parent = model.body_weldid[model.body_parentid]
     moved = []
-    heavier = f"mass.scale@{place}"
-    if heavier in evaluator.coefficient_slices and model.body_mass[body] > 0.0:
-        moved.append((heavier, mass / model.body_mass[body]))
     for other_name, other in bodies.items():
         effect = f"payload@{other_name}"
         are_linked = parent[other] == body or parent[body] == other

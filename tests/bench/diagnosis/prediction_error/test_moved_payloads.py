@@ -26,10 +26,7 @@ def evaluator(tmp_path):
 def test_a_moved_payload_stays_where_it_is_in_space(evaluator):
     """The elbow is 0.4 m below the shoulder and turns about y; centres of mass are on z."""
     place = np.array([0.05, 0.0, -0.1])
-    moved = list_moved_payloads(evaluator, "payload@upper", np.array([0.3, *place]))
-    (heavier, share), (name, c) = moved
-    upper_mass = evaluator.simulator.robot.compiled.body("upper").mass[0]
-    assert (heavier, share) == ("mass.scale@upper", pytest.approx([0.3 / upper_mass]))
+    ((name, c),) = list_moved_payloads(evaluator, "payload@upper", np.array([0.3, *place]))
     assert name == "payload@fore"
     x, z = place[0], place[2] - 0.2 + 0.4
     turned = [
@@ -37,7 +34,7 @@ def test_a_moved_payload_stays_where_it_is_in_space(evaluator):
         np.cos(ELBOW) * z + np.sin(ELBOW) * x,
     ]
     np.testing.assert_allclose(c, [0.3, turned[0], 0.0, turned[1] + 0.1], atol=1e-9)
-    _, (back, same) = list_moved_payloads(evaluator, "payload@fore", c)
+    ((back, same),) = list_moved_payloads(evaluator, "payload@fore", c)
     assert back == "payload@upper"
     np.testing.assert_allclose(same, [0.3, *place], atol=1e-9)
 

@@ -9,7 +9,7 @@ import pytest
 from bench.diagnosis.explain import explain
 from bench.diagnosis.kalman import linearised_filter
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-from bench.diagnosis.prediction_error.effects_at_joints import list_equal_inertias
+from bench.diagnosis.prediction_error.effects_at_joints import list_similar_inertias
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 ARM = """<mujoco model="arm">
@@ -71,7 +71,7 @@ def test_an_inertia_and_the_armature_that_acts_alike_change_the_mass_matrix_alik
     example_arm, name
 ):
     robot = example_arm.simulator.robot
-    ((other, coefficients),) = list_equal_inertias(example_arm, name, np.array([0.004]))
+    ((other, coefficients),) = list_similar_inertias(example_arm, name, np.array([0.004]))
     assert {name, other} == {"inertia.armature@elbow", "inertia.scale@forearm"}
     changes = {name: 0.004, other: float(coefficients[0])}
     model = mujoco.MjModel.from_xml_path(str(robot.path))
@@ -88,9 +88,18 @@ def test_an_inertia_and_the_armature_that_acts_alike_change_the_mass_matrix_alik
     assert inertia_of_joint() - before == pytest.approx(changes["inertia.armature@elbow"], rel=1e-9)
 
 
-def test_other_effects_have_no_equal_inertia(example_arm):
+def test_a_payload_may_be_a_heavier_body(example_arm):
+    model = mujoco.MjModel.from_xml_path(str(example_arm.simulator.robot.path))
+    ((other, share),) = list_similar_inertias(
+        example_arm, "payload@forearm", np.array([0.03, 0.0, 0.0, 0.1])
+    )
+    assert other == "mass.scale@forearm"
+    assert share == pytest.approx([0.03 / model.body("forearm").mass[0]])
+
+
+def test_other_effects_have_no_similar_inertia(example_arm):
     for name in ("drag.linear@elbow", "mass.scale@forearm", "inertia.armature@*"):
-        assert list_equal_inertias(example_arm, name, np.array([0.1])) == []
+        assert list_similar_inertias(example_arm, name, np.array([0.1])) == []
 
 
 @pytest.mark.parametrize(
