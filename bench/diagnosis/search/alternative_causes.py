@@ -51,28 +51,34 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     3. Select the competing models that are close enough to matter.
     4. Refit all of these to convergence.
 
-    If the residual is noise, generalised least squares is used. If it has structure, ordinary least
-    squares is used, because the structure is not noise and would distort the fit.
+    If the residual is noise, generalised least squares is used, weighted by an AR(1) model of this
+    noise. If the residual has structure, ordinary least squares is used, because the structure is
+    not noise and would distort the fit.
 
     Args:
-        search: search with all models fitted so far.
+        search: search with all models fitted so far; the refits are stored in it.
         model: best model of the search.
 
     Returns:
-        The best of these models.
+        The best of these models; with structure in the residual, the model of step 1, refitted.
     """
     effect_count = len(model.effects)
     # 1. Replaced effects.
-    # A search on fewer samples may have compared this model with all replacements already.
+    # A search on fewer samples may have compared this model (`settled_effects`) with all
+    # replacements already.
     if search.settled_effects != frozenset(model.effects):
         model = _swap_each_effect(search, model)
     # 2. Neighbouring frequencies.
     neighbour_starts = list(generate_shifted_starts(search.evaluator, model.fit))
-    # Periodic effects have dozens of local minima.
+    # Only effects with many local minima, such as periodic ones, have such starts. Segments of the
+    # runs have fewer minima, so that fits to them may find better models.
     if neighbour_starts:
         search.refit_from_segments(effect_count)
     # 3. Competing models.
+    # The models without one of the effects are refitted, too: the gain of each effect is measured
+    # from them.
     submodels = list_submodels(search, model)
+    # None if the residual has structure.
     noise = _estimate_model_noise(search, model)
     competing_models = list_competing_models(search, model)
     if noise is None:
@@ -96,24 +102,30 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
         if len(model.effects) > 1 and differ_in_one_effect(model, candidate)
     ]
     search.refit_models([*starts, *neighbour_starts], noise)
-    # A refit that ends worse is not stored, so the table contains the best fit of each model.
+    # A refit that ends worse is not stored, so `models` contains the best fit of each model.
     refitted = [search.models[frozenset(candidate.effects)] for candidate in compared_models]
     return select_likeliest(*refitted)
 
 
 def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
-    """Replace each effect by every other effect of the library, and return the best model.
+    """Replace each effect by the other effects of the library, and return the best model.
 
-    Unlike `swap_effect`, which refits only the most promising candidates, all are fitted: a cause
-    is reported only if no other effect in its place explains the data better.
+    The library has all effects that may act on the system. Unlike `swap_effect`, which refits only
+    a few candidates, there is no limit on their number: only effects whose score is far below the
+    best one are left out. A cause is reported only if no other effect in its place explains the
+    data better.
 
     Args:
         search: the search; the fitted models are added to it.
         model: the model whose effects are replaced.
+
+    Returns:
+        The best of the newly fitted models, or the given one if none is better.
     """
     size = len(model.effects)
     known_effect_sets = set(search.models)
     submodels = [search.remove_effect(model, name) for name in model.effects]
+    # The second argument is the maximum number of candidates.
     search.refit_extensions(submodels, len(search.evaluator.library))
     best = model
     for effect_set, other_model in search.models.items():
@@ -136,19 +148,21 @@ def _make_swapped_start(
 ) -> FitStart:
     """Return a start for a competing model, with all shared effects at the values of the model.
 
-    The models differ in one effect. A law with several coefficients converges to slightly different
-    values each time, which would make equivalent models look different.
+    The models differ in one effect, whose coefficients are those of the competing model. A law with
+    several coefficients converges to slightly different values each time, which would make
+    equivalent models look different.
 
     Args:
-        search: the search, with all fitted models.
-        model: fitted model: its effects, parameters, initial states and likelihood.
-        other_model: competing model.
+        search: the search, which has the position of each effect in the parameters theta.
+        model: fitted model, whose base parameters, shared effects and initial states are used.
+        other_model: fitted competing model, in which one effect of `model` is replaced.
     """
     (added_effect,) = set(other_model.effects) - set(model.effects)
     (removed_effect,) = set(model.effects) - set(other_model.effects)
     coefficient_slices = search.evaluator.coefficient_slices
     added = coefficient_slices[added_effect]
     theta = model.fit.theta.copy()
+    # Zero coefficients switch an effect off.
     theta[coefficient_slices[removed_effect]] = 0.0
     theta[added] = other_model.fit.theta[added]
     return FitStart(other_model.effects, theta, model.fit.initial_states)
@@ -174,9 +188,9 @@ def select_decisive(
 ) -> list[FittedModel]:
     """Return the competing models whose comparison with a model can change the diagnosis.
 
-    Near the noise these are all of them. Far from the noise, no competing model replaces the model;
-    they only show alternatives to one of its effects. So those that differ in several effects are
-    left out.
+    If the residual of the model is near the noise, these are all of them. Far from the noise, no
+    competing model replaces the model; they only show alternatives to one of its effects. So those
+    that differ in several effects are left out.
 
     Args:
         search: the search, with all fitted models.
@@ -192,13 +206,14 @@ def select_decisive(
 def _is_competitive(search: EffectSearch, other_model: FittedModel, model: FittedModel) -> bool:
     """Return whether two models are close in penalised log-likelihood or in excess residual.
 
-    The excess residual is the RMS residual in units of the noise, minus one. It is compared, too,
+    The excess residual is the RMS residual in units of the noise, minus one; that of the other
+    model must be below `MAX_COMPETITOR_EXCESS_RATIO` times that of the model. It is compared, too,
     because likelihoods are misleading if the residual has structure.
 
     Args:
-        search: the search, with all fitted models.
-        other_model: competing model.
-        model: fitted model: its effects, parameters, initial states and likelihood.
+        search: the search, which computes the residuals.
+        other_model: fitted model that may compete.
+        model: fitted model with which it is compared.
     """
     if (
         abs(model.penalised_log_likelihood - other_model.penalised_log_likelihood)
@@ -211,11 +226,13 @@ def _is_competitive(search: EffectSearch, other_model: FittedModel, model: Fitte
 
 
 def list_submodels(search: EffectSearch, model: FittedModel) -> list[FittedModel]:
-    """Return the models without one of the effects, from which the gain of each is measured.
+    """Return the fitted models that have all effects of a model except one.
+
+    From each of them, the gain of the missing effect is measured.
 
     Args:
         search: the search, with all fitted models.
-        model: model with more effects.
+        model: the model with all effects.
     """
     names = set(model.effects)
     size = len(names) - 1
@@ -229,14 +246,16 @@ def list_submodels(search: EffectSearch, model: FittedModel) -> list[FittedModel
 def _estimate_model_noise(search: EffectSearch, model: FittedModel) -> NoiseModel | None:
     """Estimate the AR(1) noise of each channel from the residual of a model.
 
-    Return None if the residual has structure, because it is then not noise.
-
     Args:
-        search: search for causes, with its run evaluator, noise and fitted models.
-        model: fitted model: its effects, parameters, initial states and likelihood.
+        search: search for causes, which tests the residual for structure.
+        model: fitted model, whose likelihood has sigma and correlation phi of its residual.
+
+    Returns:
+        The noise; None if the residual has structure, because it is then not noise.
     """
     if assess_lack_of_fit(search, model).has_structure:
         return None
+    # The noise is a divisor, also where a model fits a channel exactly.
     sigma = np.maximum(model.likelihood.sigma, 1e-300)
     # Correlations are never negative, as in the score test.
     return NoiseModel(sigma, np.maximum(model.likelihood.phi, 0.0))
@@ -306,7 +325,8 @@ class AlternativeFinder:
         reduced_model = self._get_model_without(model, effect)
         gain = model.likelihood.value - reduced_model.likelihood.value
         p_value = self._compute_p_value(reduced_model, effect, gain)
-        # The effect itself is included. Effects with implausible coefficients come last.
+        # The effect itself is included. Effects with implausible coefficients come last; of the
+        # others, the one whose model explains the data best comes first.
         competing_effects = sorted(
             self._list_competing_effects(model, effect),
             key=lambda competitor: (self._compute_range_excess(competitor.name), competitor),
@@ -314,7 +334,7 @@ class AlternativeFinder:
         ordered_effects = [competitor.name for competitor in competing_effects]
         alternatives = tuple(name for name in ordered_effects if name != effect)
         # With structure in the residual, indistinguishable does not mean equally likely, so the
-        # effect found is kept.
+        # effect found is kept, unless a simpler effect that it contains explains as much.
         is_kept = self.structure and effect in ordered_effects
         preferred_effect = effect if is_kept else ordered_effects[0]
         return CauseEvidence(
@@ -343,9 +363,10 @@ class AlternativeFinder:
         * the gain of the fit with the effect;
         * the linear score, which predicts gains without a fit.
 
-        Both compare with surrogate residuals: noise that contains no effect. Without scores about
-        the reduced model, those about another model are used (`reference_scores`), or new ones. If
-        the finder must not simulate (`simulates` is false), only a stored p-value is used, or 1.
+        Both compare with surrogate residuals: random noise that contains no effect. Without scores
+        about the reduced model, those about another model are used (`reference_scores`), or new
+        ones. If the finder must not simulate (`simulates` is false) and there are no scores, only a
+        stored p-value is used, or 1.
 
         Args:
             reduced_model: model without the effect.
@@ -354,6 +375,7 @@ class AlternativeFinder:
                 log-likelihood.
         """
         search = self.search
+        # Models and their scores are stored by the set of their effects.
         key = frozenset(reduced_model.effects)
         stored_scores = search.scores_by_effects.get(key)
         if stored_scores is None and not self.simulates:
@@ -362,7 +384,8 @@ class AlternativeFinder:
             stored_scores or search.reference_scores or search.score_missing_effects(reduced_model)
         )
         null_quantiles = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
-        # Gains are compared relative to what their effect gains from noise (90 % quantile).
+        # The gain minus what its effect gains from noise alone (90 % quantile) is compared with the
+        # scores of the surrogates, from which this level is subtracted as well.
         excess = gain - null_quantiles.get(effect, 0.0)
         by_refit = estimate_tail_p_value(scores.null_scores, np.array([excess]))
         by_score = search.best_p_values.get(key, 1.0)
@@ -434,6 +457,7 @@ class AlternativeFinder:
         """
         effects = self.search.evaluator.available_effects
         names = {competitor.name for competitor in competing_effects}
+        # `contains` has the names of the simpler effects, or members, that an effect contains.
         return [
             competitor
             for competitor in competing_effects
@@ -441,13 +465,14 @@ class AlternativeFinder:
         ]
 
     def _act_in_one_loop(self, effect: str, other_effect: str) -> bool:
-        """Return whether two effects act at different joints of one kinematic loop.
+        """Return whether two effects act at different joints of one closed kinematic chain (loop).
 
         Args:
             effect: name of one effect.
             other_effect: name of the other effect.
         """
         evaluator = self.search.evaluator
+        # Index of the joint of each effect; a loop is a set of such indices.
         joints = {evaluator.available_effects[name].coordinate for name in (effect, other_effect)}
         return len(joints) == 2 and any(joints <= loop for loop in evaluator.simulator.system.loops)
 

@@ -110,6 +110,10 @@ def compute_directions(
         evaluator: evaluator that simulates the recorded runs.
         fit: fit of the model, at which the responses are computed.
         names: names of effects that the model does not contain.
+
+    Returns:
+        The probes that change the runs, followed by those with modifiers, and the responses
+        (R, T, C, K) of all K of them in R runs of T samples and C channels.
     """
     probes = [
         probe for name in names for probe in iterate_first_probes(evaluator, fit.effects, name)
@@ -118,7 +122,7 @@ def compute_directions(
     responses = _compute_directions(evaluator, fit, probes)
     is_acting = _find_observable_probes(evaluator, probes, responses)
     # 2. Modifiers.
-    # The first responses show which coefficients only modify, for effects that act at all.
+    # The first responses show which coefficients change nothing alone.
     modifier_probes = list(_make_modifier_probes(evaluator, probes, is_acting))
     # 3. Responses that change something.
     active_indices = np.flatnonzero(is_acting)
@@ -133,6 +137,7 @@ def compute_directions(
         responses = np.concatenate(
             [responses, _compute_directions(evaluator, fit, modifier_probes)]
         )
+    # The probes become the last axis.
     return DirectionSet(tuple(probes), np.moveaxis(responses, 0, -1))
 
 
@@ -158,13 +163,62 @@ def iterate_first_probes(
     """
     parameters = list_coefficients(evaluator, name)
     effect = evaluator.available_effects[name]
-    coefficients = effect.coefficients
+    # What the first coefficient means, such as "stop" for an end stop.
+    kind = effect.coefficients[0].of
     # 1. Points of the effect.
     for values in effect.probe_points():
-        # Changes at several points add up to that at a point between them (`Effect.combine`).
-        yield CandidateDirection(name, 0, 0, values, can_be_negative=True)
+        # All points act together. A regression finds a weight of either sign for each of them, from
+        # which `Effect.combine` computes the coefficients of the effect.
+        yield CandidateDirection(
+            effect=name,
+            grid_point=0,
+            coefficient_index=0,
+            coefficients=values,
+            can_be_negative=True,
+        )
     # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
     shape_indices = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
+    shapes = _list_shapes(evaluator, model_effects, name, shape_indices)
+    # 2. Small values for each shape.
+    # A small limit of a force or a rate would remove all of it.
+    if kind not in NONLINEAR_COEFFICIENT_KINDS and not effect.probe_points():
+        yield from _make_small_probes(name, parameters, shape_indices, shapes)
+    # 3. Full sizes, numbered after the shapes.
+    next_grid_point = len(shapes)
+    lowest, highest = parameters[0].bounds
+    if kind == "stop":
+        yield from _make_end_stop_candidates(evaluator, name, next_grid_point)
+        return
+    # Only robots without contacts have a linearisation.
+    if kind == "shift" and evaluator.has_linearisation:
+        yield from _make_shift_probes(effect, highest, next_grid_point)
+    # A small limit does not act like a large one, so limits are tried at values that the input
+    # reaches.
+    if kind in NONLINEAR_COEFFICIENT_KINDS or (kind in ("input", "error") and lowest == 0):
+        yield from _make_limit_probes(
+            evaluator, name, next_grid_point, np.array(shapes) if shape_indices else None
+        )
+
+
+def _list_shapes(
+    evaluator: RunEvaluator,
+    model_effects: Collection[str],
+    name: str,
+    shape_indices: Sequence[int],
+) -> list[tuple[float, ...]]:
+    """Return all combinations of the values that are tried of an effect's shape parameters.
+
+    A shape parameter, such as a frequency, does not scale the effect. Without shape parameters,
+    there is one combination, which is empty.
+
+    Args:
+        evaluator: evaluator with the recorded runs.
+        model_effects: names of the effects that the model contains.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        shape_indices: indices of the shape parameters among the coefficients of the effect.
+    """
+    parameters = list_coefficients(evaluator, name)
+    coefficients = evaluator.available_effects[name].coefficients
     travel = evaluator.get_effect_travel(name)
     # The inertia of a rotor that the model has as an effect already is taken over from it, so only
     # the smallest value is tried.
@@ -174,42 +228,42 @@ def iterate_first_probes(
         else _make_shape_grid(evaluator, parameters[i], coefficients[i].tried, travel)
         for i in shape_indices
     ]
-    # All combinations of the shape parameters; a single empty one without shape parameters.
-    shapes = list(product(*grids))
-    # 2. Small values for each shape.
-    kind = coefficients[0].of
-    # A small limit of a force or a rate would remove all of it.
-    if kind not in NONLINEAR_COEFFICIENT_KINDS and not effect.probe_points():
-        for grid_point, shape in enumerate(shapes):
-            for index, parameter in enumerate(parameters):
-                if index in shape_indices:
-                    continue
-                low, high = parameter.bounds
-                values = np.zeros(len(parameters))
-                values[shape_indices] = shape
-                values[index] = INITIAL_PROBE_SHARE * high
-                # Those with the same grid point act together, such as a sine and a cosine.
-                yield CandidateDirection(
-                    effect=name,
-                    grid_point=grid_point,
-                    coefficient_index=index,
-                    coefficients=values,
-                    can_be_negative=low < 0,
-                )
-    # 3. Full sizes.
-    next_grid_point = len(shapes)
-    lowest, highest = parameters[0].bounds
-    if kind == "stop":
-        yield from _make_end_stop_candidates(evaluator, name, next_grid_point)
-        return
-    if kind == "shift" and evaluator.has_linearisation:
-        yield from _make_shift_probes(effect, highest, next_grid_point)
-    # A small limit does not act like a large one, so limits are tried at values that the input
-    # reaches.
-    if kind in NONLINEAR_COEFFICIENT_KINDS or (kind in ("input", "error") and lowest == 0):
-        yield from _make_limit_probes(
-            evaluator, name, next_grid_point, np.array(shapes) if shape_indices else None
-        )
+    return list(product(*grids))
+
+
+def _make_small_probes(
+    name: str,
+    parameters: Sequence[Parameter],
+    shape_indices: Sequence[int],
+    shapes: Sequence[tuple[float, ...]],
+) -> Iterator[CandidateDirection]:
+    """Yield a small value of each scaling coefficient of an effect, with each of its shapes.
+
+    The values are so small that the runs respond to them in proportion. All other scaling
+    coefficients are zero.
+
+    Args:
+        name: name of the effect.
+        parameters: the k coefficients of the effect, with their plausible ranges.
+        shape_indices: indices of the coefficients that are shape parameters, such as frequencies.
+        shapes: combinations of values of the shape parameters.
+    """
+    for grid_point, shape in enumerate(shapes):
+        for index, parameter in enumerate(parameters):
+            if index in shape_indices:
+                continue
+            low, high = parameter.bounds
+            values = np.zeros(len(parameters))
+            values[shape_indices] = shape
+            values[index] = INITIAL_PROBE_SHARE * high
+            # Those with the same grid point act together, such as a sine and a cosine.
+            yield CandidateDirection(
+                effect=name,
+                grid_point=grid_point,
+                coefficient_index=index,
+                coefficients=values,
+                can_be_negative=low < 0,
+            )
 
 
 def _make_shift_probes(
@@ -273,6 +327,7 @@ def _make_end_stop_candidates(
         name: name of the end-stop effect.
         first_grid_point: number of the first candidate; the following ones count up from it.
     """
+    # The side is 1 for the upper end of the range, and -1 for the lower end.
     end_stops = [
         coefficients
         for side in (1.0, -1.0)
@@ -305,22 +360,27 @@ def generate_end_stops(
     All combinations of stiffness and depth are tried, because the response to an end stop is not
     linear. There are none if the range of the coordinate is not recorded.
 
+    The first coefficient is the stiffness, positive for an upper and negative for a lower end stop,
+    the second one its position. All others are zero.
+
     Args:
         evaluator: evaluator with the recorded runs.
-        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        name: name of an end-stop effect, with its place on a robot.
         side: 1 for the upper end, -1 for the lower end.
         stiffness_shares: stiffnesses, as fractions of the largest plausible one.
         depth_shares: depths within the range of the coordinate, as fractions of the range.
     """
+    # Both are zero if the coordinate is not recorded.
     low, high = evaluator.get_coordinate_range(name)
+    if not low < high:
+        return
     parameters = list_coefficients(evaluator, name)
     max_stiffness = parameters[0].bounds[1]
-    for stiffness_share, depth_share in (
-        product(stiffness_shares, depth_shares) if low < high else ()
-    ):
+    end = high if side > 0 else low
+    for stiffness_share, depth_share in product(stiffness_shares, depth_shares):
         coefficients = np.zeros(len(parameters))
         coefficients[0] = side * stiffness_share * max_stiffness
-        coefficients[1] = (high if side > 0 else low) - side * depth_share * (high - low)
+        coefficients[1] = end - side * depth_share * (high - low)
         yield coefficients
 
 
@@ -337,12 +397,17 @@ def _make_limit_probes(
         evaluator: evaluator that simulates the recorded runs.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         first_grid_point: number of the first candidate; the following ones count up from it.
-        shapes: (n, k - 1) shape parameters to combine with each size; None if there are none.
+        shapes: (n, k - 1) values of the shape parameters, such as a rotor's share of the
+            inertia, to combine with each size; None if the effect has no shape parameters.
     """
+    # One value for each member of a family, otherwise a single one.
     largest = compute_reachable_levels(evaluator, name)
+    # A limit of a quantity that is always zero has no effect.
     if not largest.any():
         return
-    # The error of a servo peaks briefly after a jump, as the rate of a command does.
+    # Fractions by the kind of quantity that is limited (`Coefficient.of`); all other kinds are
+    # levels of an input. The error of a servo peaks briefly after a jump, as the rate of a command
+    # does.
     shares_by_kind = {
         "input/s": RATE_LIMIT_SHARES,
         "input/s^2": ACCELERATION_LIMIT_SHARES,
@@ -353,7 +418,7 @@ def _make_limit_probes(
     kind = evaluator.available_effects[name].coefficients[0].of
     shares = shares_by_kind.get(kind, INPUT_LEVEL_SHARES)
     if kind == "travel" and evaluator.has_linearisation:
-        # Simulating a robot costs a hundred times as much, so fewer sizes are tried.
+        # Simulating a robot costs a hundred times as much, so the extreme sizes are left out.
         shares = GAP_TRAVEL_SHARES[1:4]
     sizes = [share * largest for share in shares]
     if shapes is not None:
@@ -385,7 +450,7 @@ def _make_shape_grid(
         evaluator: evaluator with the recorded runs.
         parameter: shape parameter, with its unit and bounds.
         specified_values: values that the coefficient specifies itself, if any.
-        travel: largest range of the position in one run.
+        travel: largest range of the position in one run, in m or rad.
     """
     if specified_values:
         return np.array(specified_values)
@@ -396,6 +461,7 @@ def _make_shape_grid(
         min_frequency = max(low, MIN_CYCLES_PER_RUN / evaluator.longest_duration)
         lowest_frequency = min(min_frequency, high / 2.0)
         return _make_frequency_grid(lowest_frequency, high, evaluator.longest_duration)
+    # A period over position, such as that of cogging: its inverse is spaced like a frequency.
     if is_period(parameter, travel):
         frequencies = _make_frequency_grid(1.0 / high, 1.0 / low, travel)
         return 1.0 / frequencies
@@ -417,8 +483,8 @@ def _make_frequency_grid(low: float, high: float, extent: float) -> Array:
     Two frequencies that differ by less are nearly the same signal in a run. `extent` is the length
     of the longest run in seconds, or the range of the position for frequencies over position.
     """
-    halves = 2.0 * (high - low) * extent
-    count = int(np.clip(halves, 4, MAX_FREQUENCIES))
+    half_cycle_count = 2.0 * (high - low) * extent
+    count = int(np.clip(half_cycle_count, 4, MAX_FREQUENCIES))
     # Low frequencies are closer together, because their periods would be far apart otherwise.
     shares = np.linspace(0.0, 1.0, count) ** FREQUENCY_SPACING_EXPONENT
     frequencies: Array = low + (high - low) * shares
@@ -435,7 +501,8 @@ def _find_observable_probes(
     Args:
         evaluator: run evaluator with the recorded runs.
         probes: K effects, each with the coefficients at which its response was computed.
-        values: (K, R, T, C) change of the runs by each probe, divided by the size of the probe.
+        values: (K, R, T, C) change of the runs by each probe, divided by the size of the probe
+            (`_compute_probe_sizes`).
     """
     # Rounding error (C,) of each channel.
     rounding = ROUNDING_SHARE * np.nanmax(np.abs(evaluator.observed), axis=(0, 1))
@@ -481,8 +548,9 @@ def _make_modifier_probes(
     for probe, acts in zip(probes, acting, strict=True):
         if acts:
             acting_probes.setdefault(probe.effect, probe)
-        # The first shape already shows whether a coefficient acts by itself; members of a family do
-        # not modify each other.
+        # The first shape (grid point 0) already shows whether a coefficient acts by itself. A limit
+        # that is never reached is no modifier, and members of a family (an effect at all places)
+        # do not modify each other.
         elif (
             probe.grid_point == 0
             and not probe.is_single_size
@@ -500,10 +568,12 @@ def _iterate_grid_points(
 ) -> Iterator[CandidateDirection]:
     """Yield an active coefficient of an effect together with all combinations of modifier values.
 
+    Each combination has a grid point of its own, because only one of them can be right.
+
     Args:
         evaluator: evaluator, which has the bounds of the coefficients.
-        first: the first coefficient of the effect with a response.
-        modifiers: coefficients that act only together with it.
+        first: probe of the first coefficient of the effect with a response.
+        modifiers: probes of the coefficients that act only together with it.
     """
     parameters = list_coefficients(evaluator, first.effect)
     points = product(MODIFIER_SHARES, repeat=len(modifiers))

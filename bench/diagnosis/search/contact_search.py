@@ -43,7 +43,11 @@ from bench.diagnosis.search.effect_search import (
 )
 from bench.diagnosis.search.fit_starts import select_refit_starts
 from bench.diagnosis.search.random_search import EXPLAINED_SQUARES, RandomStartSearch
-from bench.diagnosis.search.score_test import SHAPE_COUNT_FOR_MULTISTART, ScoreTest
+from bench.diagnosis.search.score_test import (
+    SHAPE_COUNT_FOR_MULTISTART,
+    CandidateScores,
+    ScoreTest,
+)
 from sims.core.effect import members_of
 from sims.core.simulator import Array
 
@@ -143,18 +147,23 @@ def _search_states_of_base(search: EffectSearch) -> None:
     noise, it lacks an effect, and nothing is searched.
     """
     base = search.base_model
+    # The excess is the RMS residual in units of the noise, minus one.
     if not search.compute_excess_residual(base) < MAX_EXCESS_OF_WRONG_STATES:
         return
     evaluator = search.evaluator
     states_before, deviations_before = evaluator.initial_state_guesses, evaluator.state_prior
+    # With contacts, initial states have been smoothed, which gives their standard deviations.
     assert deviations_before is not None
     # It replaces the initial states of the evaluator if it finds better ones.
     _search_first_states(search, evaluator, base.fit.theta)
     states = evaluator.initial_state_guesses
+    # The array was not replaced: there are no better initial states.
     if states is states_before:
         return
+    # Sums of squares about other initial states are not comparable.
     search.models.clear()
     model = search.fit_one(FitStart((), base.fit.theta, states))
+    # Restore the former initial states, because the fit about the new ones is not better.
     if not model.penalised_log_likelihood > base.penalised_log_likelihood:
         evaluator.begin_at(states_before, deviations_before)
         search.models[frozenset()] = base
@@ -173,6 +182,7 @@ def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
     """
     base, evaluator = search.base_model, search.evaluator
     states, deviations = evaluator.initial_state_guesses, evaluator.state_prior
+    # With contacts, initial states have been smoothed, which gives their standard deviations.
     assert deviations is not None
     fits: list[FittedModel] = []
     # 1. The likeliest effect at a contact.
@@ -181,7 +191,8 @@ def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
         value = _refine_coefficient(search, likeliest)
         fits.append(_fit_about_its_first_states(search, _make_start(search, value, states)))
     # 2. Other effects, from the initial states of the base model.
-    # The fit has replaced these states, and its cost is not comparable with fits about others.
+    # The fit of step 1 has replaced these states, which are restored. Its model is removed from the
+    # search, because costs of fits about different initial states are not comparable.
     if not any(_is_explained(search, model) for model in fits):
         evaluator.begin_at(states, deviations)
         search.models.clear()
@@ -203,7 +214,8 @@ def _list_single_effect_starts(search: EffectSearch) -> list[FitStart]:
 
     They start at the initial states of the base model. Their rank is the number of coefficients
     times the remaining sum of squares (the cost), lower is better. So an effect with more
-    coefficients has to explain more.
+    coefficients has to explain more. Only the best `MAX_TRIED_EFFECTS` are returned, and only if
+    their rank is clearly below the cost of the base model.
 
     1. Effects at contacts are scanned over the range of their coefficient, without a fit.
     2. Of all other effects, those with the best scores are fitted.
@@ -215,7 +227,8 @@ def _list_single_effect_starts(search: EffectSearch) -> list[FitStart]:
     base, evaluator = search.base_model, search.evaluator
     states = base.fit.initial_states
     # 1. Effects at contacts.
-    # Pairs of rank and start.
+    # Pairs of rank and start. Effects at contacts have one coefficient, so that their rank is the
+    # sum of squares.
     ranked_starts = [
         (value.squares, _make_start(search, value, states))
         for value in _rank_effects_at_contacts(search, base)
@@ -238,12 +251,16 @@ def _list_member_starts(search: EffectSearch, model: FittedModel) -> list[tuple[
     """Return starts with single members of a fitted family, with their sums of squares.
 
     A family is one effect with a coefficient for each place, such as friction at all joints. Often
-    only one member acts, and a model with one coefficient is simpler. The list is empty for effects
-    of another kind.
+    only one member acts, and a model with one coefficient is simpler. Each member starts from its
+    coefficient in the family.
 
     Args:
         search: search with its run evaluator.
         model: fitted model with one effect.
+
+    Returns:
+        Pairs of sum of squares and start; empty if the effect is no family, or if its members do
+        not have one coefficient each.
     """
     (name,) = model.effects
     evaluator, fit = search.evaluator, model.fit
@@ -253,6 +270,7 @@ def _list_member_starts(search: EffectSearch, model: FittedModel) -> list[tuple[
         return []
     starts = []
     for member, index in zip(members, indices, strict=True):
+        # A member need not be in the library as an effect of its own.
         if member not in evaluator.coefficient_slices:
             continue
         theta = fit.theta.copy()
@@ -279,8 +297,12 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
     4. Fit all of them by Levenberg-Marquardt.
 
     Args:
-        search: search with its models and run evaluator.
+        search: search with its models and run evaluator. The fit is stored in its models, and the
+            evaluator keeps the last estimate of the initial states.
         start: start with a single effect.
+
+    Returns:
+        The fit of the last round.
     """
     evaluator, sigma = search.evaluator, search.noise.sigma
     (name,) = start.effects
@@ -288,6 +310,7 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
     bounds = np.array(compute_coefficient_bounds(evaluator, name))
     is_at_contact = evaluator.available_effects[name].at == "contact"
     rng = search.make_rng("initial states", start.effects)
+    # Another round follows only if the cost is below this limit, which decreases with the cost.
     limit = MAX_REPEATED_COST_RATIO * search.base_model.fit.cost
     theta = start.theta
     for _ in range(MAX_STATE_ESTIMATES):
@@ -304,7 +327,7 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
                 unit=_get_unit(search, name),
                 squares=np.inf,
             )
-            states = np.array([one.mean for one in smoothed])
+            states = np.array([run_start.mean for run_start in smoothed])
             theta = _add_effect(search, _scan_in_turn(search, value, NEAR_SCAN_WIDTHS, states))
         # 3. Random search.
         widths = _compute_widths(search, name, theta[indices])
@@ -331,6 +354,7 @@ def _compute_widths(search: EffectSearch, name: str, coefficients: Array) -> Arr
     relative to the value of the model file that it changes.
     """
     is_at_contact = search.evaluator.available_effects[name].at == "contact"
+    # Values to which the widths are relative.
     units = _get_unit(search, name) if is_at_contact else np.abs(coefficients)
     return np.broadcast_to(SAMPLED_WIDTH * units, coefficients.shape)
 
@@ -355,9 +379,11 @@ def _use_first_states_of(
     """
     base, evaluator = search.base_model, search.evaluator
     deviations = evaluator.state_prior
+    # With contacts, initial states have been smoothed, which gives their standard deviations.
     assert deviations is not None
     evaluator.begin_at(model.fit.initial_states, deviations)
     search.models.clear()
+    # A start without effects is that of the base model.
     search.refit_models([FitStart((), base.fit.theta, evaluator.initial_state_guesses)])
     model = search.fit_to_convergence(search.add_fit(model.fit))
     held_out = [other for other in evaluators if other is not evaluator]
@@ -379,10 +405,11 @@ def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array)
         theta: (P,) parameters of the model.
     """
     sigma, sample_count = search.noise.sigma, int(np.isfinite(runs.observed).sum())
-    (before,) = _compute_squares(runs, sigma, theta[None], runs.initial_state_guesses)
-    smoothed = None
-    if before > EXPLAINED_SQUARES * sample_count:
-        smoothed = smooth_first_states(runs, theta, sigma)
+    (squares_before,) = _compute_squares(runs, sigma, theta[None], runs.initial_state_guesses)
+    if not squares_before > EXPLAINED_SQUARES * sample_count:
+        return
+    smoothed = smooth_first_states(runs, theta, sigma)
+    # The runs cannot be filtered with these parameters.
     if smoothed is None:
         return
     rng = search.make_rng("initial states")
@@ -390,7 +417,7 @@ def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array)
     best_sample = RandomStartSearch(runs, sigma, smoothed, rng).run(
         theta, indices=[], widths=np.zeros(0), bounds=np.zeros((0, 2))
     )
-    if best_sample.mean_square * sample_count < before:
+    if best_sample.mean_square * sample_count < squares_before:
         runs.begin_at(best_sample.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed))
 
 
@@ -408,6 +435,7 @@ def _compute_squares(evaluator: RunEvaluator, sigma: Array, samples: Array, stat
         states: (R, s) initial states.
     """
     run_count, sample_count = len(states), len(samples)
+    # Every run is simulated with every set of parameters, in one batch.
     simulated = evaluator.simulate(
         np.repeat(samples, run_count, axis=0),
         np.tile(np.arange(run_count), sample_count),
@@ -450,7 +478,7 @@ def _get_unit(search: EffectSearch, name: str) -> float:
 
     Coefficients at contacts are scanned in multiples of this value.
     """
-    # A coefficient is limited below, where the number of the file becomes zero.
+    # The lower bound of the first coefficient is where the number of the file becomes zero.
     return -compute_coefficient_bounds(search.evaluator, name)[0][0]
 
 
@@ -500,9 +528,12 @@ def _rank_effects_at_contacts(search: EffectSearch, base: FittedModel) -> list[_
     scanned_values = _scan_effects_at_contacts(search, base.fit.initial_states)
     if not scanned_values:
         return []
-    # With the coefficient zero, any effect is off.
+    # With the coefficient zero, any effect is off. A scan of width zero simulates only this value.
     without_effect = _scan(
-        search, scanned_values[0]._replace(coefficient=0.0), 0.0, base.fit.initial_states
+        search,
+        scanned_values[0]._replace(coefficient=0.0),
+        width=0.0,
+        states=base.fit.initial_states,
     )
     limit = MAX_SCAN_RATIO * without_effect.squares
     useful = [value for value in scanned_values if value.squares < limit]
@@ -513,7 +544,7 @@ def find_lowest_scan(search: EffectSearch) -> float:
     """Return the lowest sum of squares of scans of all effects at contacts; infinite without any.
 
     If it is far below that of the present model, an effect at a contact acts. The initial states
-    are those that were estimated with the present model.
+    are those that were estimated with the present model. Squares are in units of the noise.
     """
     scanned_values = _scan_effects_at_contacts(search, search.evaluator.initial_state_guesses)
     return min((value.squares for value in scanned_values), default=np.inf)
@@ -537,10 +568,15 @@ def _scan_in_turn(
 def _list_nearby_values(
     search: EffectSearch, value: _ScannedValue, distances: Array
 ) -> list[_ScannedValue]:
-    """Return coefficients near a value, within its bounds.
+    """Return coefficients near a value of an effect at a contact, within its bounds.
 
-    `distances` are in units of the value of the model file that the effect changes.
+    Args:
+        search: search with its run evaluator.
+        value: the effect, with the coefficient about which the others lie.
+        distances: (N,) distances from it, in units of the number of the model file that the effect
+            changes.
     """
+    # An effect at a contact has one coefficient.
     ((low, high),) = compute_coefficient_bounds(search.evaluator, value.name)
     coefficients = np.clip(value.coefficient + value.unit * distances, low, high)
     return [value._replace(coefficient=float(c)) for c in coefficients]
@@ -569,8 +605,8 @@ def _scan(search: EffectSearch, value: _ScannedValue, width: float, states: Arra
 def _compute_log_likelihoods(search: EffectSearch, values: Sequence[_ScannedValue]) -> Array:
     """Return the log-likelihood (N,) of each value of a coefficient, summed over the runs.
 
-    A cubature Kalman filter follows each run with each value. It adds a missing force, so it
-    follows the data even if the model lacks an effect.
+    A cubature Kalman filter follows each run with each value. It allows for a missing force
+    (process noise), so that it follows the data even if the model lacks an effect.
 
     Args:
         search: search with its run evaluator and noise.
@@ -622,6 +658,7 @@ def search_in_contact(search: EffectSearch) -> FittedModel:
         search.best_supported_model = model
         return model
     # 2. All laws.
+    # Stored scores (`cached_scans`, `superseded_scans`) lack the excluded laws.
     search.excluded_effects = frozenset()
     search.cached_scans.clear()
     search.superseded_scans.clear()
@@ -660,6 +697,7 @@ def _search_simple_laws(search: EffectSearch) -> FittedModel:
     best = select_likeliest(*search.models.values())
     if not search.is_noise_like(best) or not search.is_complete(best, MAX_P_VALUE_FURTHER_EFFECT):
         return search.run()
+    # The base model alone explains the recording.
     if not best.effects:
         return best
     # For the p-value of the effect, the surrogates of these scores stand for those about the model
@@ -695,7 +733,8 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     columns = _find_columns(search, model)
     change = _compute_change(search, model)
     # 2. Scores.
-    # A test about the model itself would project out the change.
+    # A test about the model itself would project out the change, because the fit has derivatives by
+    # the coefficients of the effect. So these columns are removed.
     fit_without_effect = replace(
         model.fit,
         effects=(),
@@ -710,7 +749,7 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     )
     scores = test.compute_scores(residual + change)
     # 3. Selection.
-    # Initial states absorb a part of the change.
+    # Parameters and initial states absorb a part of the change, as they would in a fit.
     (residual_without_effect,) = test.project_out((residual + change)[None])
     squares_without, squares_with = (
         float(np.square(values / search.noise.sigma).sum())
@@ -722,24 +761,11 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     competing_squares = squares_without * np.exp(-scores.white_noise_scores / sample_count)
     # RMS of the residual of each effect, relative to that of the present effect.
     relative_residuals = np.sqrt(competing_squares / squares_with)
-    order = [
-        int(i)
-        for i in np.argsort(relative_residuals)
-        if relative_residuals[i] < MAX_COMPETITOR_SIZE
-    ][:MAX_COMPETITORS]
-    if not order:
+    competitors = _select_smallest_residuals(scores, relative_residuals)
+    if not competitors.effects:
         return
-    competitors = replace(
-        scores,
-        effects=tuple(scores.effects[i] for i in order),
-        score=scores.score[order],
-        null_quantiles=scores.null_quantiles[order],
-        peaks=tuple(scores.peaks[i] for i in order),
-        null_scores=scores.null_scores[order],
-        white_noise_scores=scores.white_noise_scores[order],
-    )
     # 4. Fits.
-    # They start from the model without its effect.
+    # They start from the parameters of the model, with its effect off.
     theta = model.fit.theta.copy()
     theta[search.evaluator.coefficient_slices[name]] = 0.0
     base = search.base_model
@@ -754,6 +780,34 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
         fits_all=False,
     )
     search.refit_models(starts, is_racing=False)
+
+
+def _select_smallest_residuals(
+    scores: CandidateScores, relative_residuals: Array
+) -> CandidateScores:
+    """Return the scores of the effects that leave the smallest residuals, in ascending order.
+
+    They are at most `MAX_COMPETITORS`, and each of their residuals is below `MAX_COMPETITOR_SIZE`.
+
+    Args:
+        scores: scores of E effects.
+        relative_residuals: (E,) RMS of the residual of each effect, relative to that of the effect
+            it may replace.
+    """
+    order = [
+        int(i)
+        for i in np.argsort(relative_residuals)
+        if relative_residuals[i] < MAX_COMPETITOR_SIZE
+    ][:MAX_COMPETITORS]
+    return replace(
+        scores,
+        effects=tuple(scores.effects[i] for i in order),
+        score=scores.score[order],
+        null_quantiles=scores.null_quantiles[order],
+        peaks=tuple(scores.peaks[i] for i in order),
+        null_scores=scores.null_scores[order],
+        white_noise_scores=scores.white_noise_scores[order],
+    )
 
 
 def _find_columns(search: EffectSearch, model: FittedModel) -> list[int]:

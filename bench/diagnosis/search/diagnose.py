@@ -134,6 +134,8 @@ class Diagnosis:
         Raises:
             SearchStoppedError: the search had to end early.
         """
+        # Before each step, `begin_question` tells the search control which question is open. It
+        # needs this for the progress display and after an early end.
         # 1. Base model.
         early_result = self.classify_unfit_base()
         if early_result is not None:
@@ -220,7 +222,8 @@ class Diagnosis:
             return
         self._search_control.begin_question("held_out")
         validation = _validate_on_held_out(self._search, self._model, self._held_out)
-        # Unfinished fits of initial states would be held against their model.
+        # After an early stop, some fits of initial states are unfinished, so that their models
+        # would seem to predict badly.
         self._search_control.check_not_stopped()
         self._held_out_validation = validation
         # The effects that remain after dropping an unhelpful one may have simpler forms.
@@ -258,8 +261,10 @@ class Diagnosis:
         a part of the time limit was reserved.
         """
         search = self._search
+        # It lists the questions of the diagnosis that stay open.
         early_stop = self._search_control.make_early_stop(self._held_out is not None)
         model = self._model or search.get_best_so_far()
+        # If the validation is stopped, too, the verdict does without it.
         if self._held_out_validation is None and self._held_out is not None and model.effects:
             validation = HeldOutValidation(self._held_out)
             with suppress(SearchStoppedError), self._search_control.use_reserve():
@@ -269,12 +274,12 @@ class Diagnosis:
         # The residual was not tested, so the verdict counts it as structure and not as noise. The
         # report shows only its size.
         lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)
-        alternatives = self.alternative_finder(
+        finder = self.alternative_finder(
             search, self._held_out_validation, structure=False, simulates=False
         )
-        causes = alternatives.collect_evidence(model)
-        share = compute_gap_closed(search, model, lack_of_fit)
-        verdict = decide_early_stop_verdict(len(causes), share, early_stop.skipped_questions)
+        causes = finder.collect_evidence(model)
+        gap_closed = compute_gap_closed(search, model, lack_of_fit)
+        verdict = decide_early_stop_verdict(len(causes), gap_closed, early_stop.skipped_questions)
         result = self._make_result(
             verdict, search.base_model, model, causes, assess_residual_size(search, model)
         )
@@ -310,7 +315,8 @@ class Diagnosis:
 def is_motionless(search: EffectSearch) -> bool:
     """Return whether the recording shows no motion, and the base model expects none.
 
-    Without motion the residual is only rounding, so the diagnosis ends before the search.
+    Without motion the residual is only rounding, so the diagnosis ends before the search. The
+    thresholds are in `verdict_rules.is_motionless`.
     """
     # Range of each channel (C,) over all runs and samples (R, T, C).
     observed = search.evaluator.observed
@@ -335,6 +341,7 @@ def _build_motionless_result(search: EffectSearch) -> DiagnosisResult:
         model=base,
         base=base,
         causes=(),
+        # No force was tested, and nothing counts as structure.
         lack_of_fit=LackOfFitResult(
             p_value=1.0,
             where="",
@@ -349,11 +356,14 @@ def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tup
     """Return the sensitive base parameters that the data do not determine, the worst first.
 
     A parameter is not determined if its standard deviation is too large a share of its plausible
-    range.
+    range. Parameters that do not influence the runs were fixed in the base fit, and are not tested.
 
     Args:
         search: search for causes, with its run evaluator, noise and fitted models.
         base: base model: the simulator without additional effects, fitted to the runs.
+
+    Returns:
+        Names of the parameters, in descending order of the ratio of standard deviation to range.
     """
     variances = np.diagonal(compute_covariance(search, base))
     # Rounding may make a variance slightly negative.
@@ -402,7 +412,7 @@ def _is_unexplained(search: EffectSearch, model: FittedModel, lack_of_fit: LackO
 
     A score test predicts the gain of each missing effect, to first order and without a fit. The
     p-value of the best one comes from an earlier test, or from one that is made here if the
-    residual is above the noise.
+    residual is above the noise and has no structure. Otherwise it counts as 1.
 
     Args:
         search: the search, with all fitted models.
@@ -429,7 +439,10 @@ def compute_gap_closed(
     Args:
         search: search for causes, with its run evaluator, noise and fitted models.
         model: the extended model.
-        lack_of_fit: lack-of-fit test of the model: p-value and description.
+        lack_of_fit: lack-of-fit test of the model, which tells whether its residual has structure.
+
+    Returns:
+        The share: 1 if the model leaves only noise, negative if it is worse than the base model.
     """
     noise = search.noise.sigma
     residual_sigma = model.likelihood.sigma

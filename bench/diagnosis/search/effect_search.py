@@ -105,13 +105,13 @@ class EffectSearch(ScoredModelSet):
     def run(self) -> FittedModel:
         """Return the model of all effects that the data show (beam search).
 
-        For each number of effects:
+        Models are stored by their effects. The base model has none. For each number of effects:
 
         1. Stop if neither scores nor residual suggest a further effect.
         2. Fit models with one more effect.
         3. Accept the best of them if its gain is significant.
-        4. Otherwise continue only far from the noise: if two effects explain the data only
-           together, neither gains much alone.
+        4. Otherwise continue only if the residual of the best model is far above the noise: if two
+           effects explain the data only together, neither gains much alone.
         5. Stop if the larger model is still far from the data.
         """
         best = self.base_model
@@ -126,6 +126,7 @@ class EffectSearch(ScoredModelSet):
                 break
             # 2. One more effect.
             larger = self._search_size(best, effect_count)
+            # No model of this size could be fitted.
             if larger is None:
                 break
             # 3. Significant gain.
@@ -157,6 +158,7 @@ class EffectSearch(ScoredModelSet):
             The best model of the same size after the correction, which may be a simpler one.
         """
         key = frozenset(model.effects)
+        # Only robots are corrected, and not twice in succession about the same effects.
         if not self.evaluator.has_linearisation or key == self.step_corrected_effects:
             return model
         self.step_corrected_effects = key
@@ -190,6 +192,7 @@ class EffectSearch(ScoredModelSet):
         The best larger fitted model replaces the present one if its penalised log-likelihood is
         higher and its gain is significant by the known scores.
         """
+        # The latest fit of these effects.
         best = self.models[frozenset((self.best_supported_model or self.base_model).effects)]
         larger = [m for m in self.models.values() if len(m.effects) > len(best.effects)]
         scores = self.scores_by_effects.get(frozenset(best.effects))
@@ -223,6 +226,7 @@ class EffectSearch(ScoredModelSet):
         larger = self._grow_models(size)
         if larger is None:
             return None
+        # A single effect has no others to drop or exchange.
         if size == 1:
             return self.simplify_laws(self._choose_simpler_effect(larger))
         # An unneeded effect is dropped before the exchange, which would only replace it by another
@@ -259,12 +263,14 @@ class EffectSearch(ScoredModelSet):
         """Return whether the best model with `size` effects leaves nothing to explain.
 
         Its residual must be noise, and no effect that it lacks may have a significant score. Scores
-        cost many simulations, and are computed only if the residual is noise.
+        cost many simulations, and are computed only if the residual is noise. It is False if no
+        model of this size was fitted.
         """
         model = self.get_best(size)
         if model is None:
             return False
-        # The discretisation error, of friction for example, could be mistaken for a missing effect.
+        # The discretisation error of a robot's simulator, for example of friction, could be
+        # mistaken for a missing effect.
         if self.evaluator.has_linearisation and self.compute_excess_residual(model) < FAR_EXCESS:
             model = self.correct_step_errors(model)
         return self.is_noise_like(model) and self.is_complete(model, EFFECT_P_VALUE_THRESHOLD)
@@ -298,11 +304,12 @@ class EffectSearch(ScoredModelSet):
         if self._segment_search is None:
             self._segment_search = EffectSearch(
                 segment_evaluator,
-                self.noise,
-                self.fixed_parameters,
-                self.make_rng("pieces"),
-                self.is_noise_stated,
+                noise=self.noise,
+                fixed_parameters=self.fixed_parameters,
+                rng=self.make_rng("pieces"),
+                is_noise_stated=self.is_noise_stated,
             )
+            # The base model, which has no effects.
             self._segment_search.refit_models(
                 [FitStart((), self.base_model.fit.theta, segment_evaluator.initial_state_guesses)]
             )
@@ -311,6 +318,7 @@ class EffectSearch(ScoredModelSet):
             select_beam(segment_search, size - 1), MAX_REFITTED_CANDIDATES
         )
         best_models = select_by_size(segment_search, size)[:SEGMENT_MODELS_KEPT]
+        # Whole runs begin at the initial states of their first segments.
         if best_models:
             self.refit_models(
                 [join_segment_fits(self.evaluator, model.fit) for model in best_models]
@@ -340,7 +348,7 @@ class EffectSearch(ScoredModelSet):
         A simpler effect is one that the effect contains, as Stribeck friction contains Coulomb
         friction. It is preferred if something is still missing, to which the richer effect may have
         adapted, and the richer one does not at least halve the excess residual (RMS residual in
-        units of the noise, minus one).
+        units of the noise, minus one). Only simpler effects that were fitted already are compared.
 
         Args:
             single: fitted model with one effect; it is returned if no simpler one is preferable.
@@ -422,6 +430,7 @@ class EffectSearch(ScoredModelSet):
         in units of the noise, minus one). It is then simplified further.
         """
         for name in model.effects:
+            # The simpler effects that replace the effect together, usually a single one.
             for parts in self._iterate_simpler_effects(model, name):
                 simpler_model = self._fit_with_parts(model, name, parts)
                 # Without an excess, both models leave only noise, and the ratio means nothing.
@@ -446,6 +455,9 @@ class EffectSearch(ScoredModelSet):
         Args:
             model: fitted model: its effects, parameters, initial states and likelihood.
             name: name of the effect to replace.
+
+        Yields:
+            One or several simpler effects that replace it together, with their coefficients (k,).
         """
         contained_laws = self._split_into_contained_laws(model, name)
         for law, coefficients in contained_laws.items():
@@ -502,6 +514,7 @@ class EffectSearch(ScoredModelSet):
             model: fitted model: its effects, parameters, initial states and likelihood.
             name: name of the family.
         """
+        # Only a family has members; they are all of one kind.
         members = getattr(self.evaluator.available_effects[name], "members", ())
         indices = self.evaluator.get_coefficient_indices(name)
         count_per_member = len(members[0].coefficients) if members else 0
@@ -532,7 +545,8 @@ class EffectSearch(ScoredModelSet):
         names = tuple(dict.fromkeys(chain.from_iterable(effects_of_each)))
         key = frozenset(names)
         simplification = frozenset(model.effects), key
-        # A known model may be at a poor local minimum, so it is fitted again unless it is better.
+        # A known model may be at a poor local minimum, so it is fitted again unless it is better
+        # than the model with the richer effect.
         is_fit_needed = (
             key not in self.models
             or self.models[key].penalised_log_likelihood < model.penalised_log_likelihood
@@ -558,6 +572,7 @@ class EffectSearch(ScoredModelSet):
             self.refit_extensions(
                 [self.remove_effect(model, name) for name in model.effects], MAX_REFITTED_CANDIDATES
             )
+            # The best of all models with as many effects.
             better = self.get_best(len(model.effects))
             if (
                 better is None
@@ -587,9 +602,11 @@ def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
         size: number of effects of the models.
     """
     members = select_by_size(search, size)
+    # Of size 0, there is only the base model.
     if not size or not members:
         return members
     base_likelihood = search.base_model.penalised_log_likelihood
+    # The members are in descending order of their likelihood.
     best_gain = members[0].penalised_log_likelihood - base_likelihood
     best_models = [
         model
@@ -603,9 +620,9 @@ def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
 def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:
     """Return whether a model of several effects is too far from the data to try another effect.
 
-    Its excess residual (RMS residual in units of the noise, minus one) is compared with those of
-    the base model and of the best single effect. In a thorough search, all models of the same size
-    must be too far.
+    Its excess residual (RMS residual in units of the noise, minus one) must be below a share of
+    those of the base model and of the best single effect; otherwise it is too far. In a thorough
+    search, all models of the same size must be too far.
 
     Args:
         search: the search, with all fitted models.

@@ -93,25 +93,18 @@ def select_refit_starts(
         model: fitted model to extend by one effect.
         direction_set: directions, which are the responses of the runs to the candidate effects.
         scores: scores of the candidates about this model.
-        max_count: maximum number of candidates.
-        fits_all: whether to include all candidates, or for robots up to `MAX_REFITS_THOROUGH`.
+        max_count: maximum number of candidates, unless `fits_all`.
+        fits_all: True to return starts of all candidates, whatever their scores; for robots, of the
+            best `MAX_REFITS_THOROUGH`, because their simulations are expensive.
+
+    Returns:
+        The starts, at most one for each score peak of each selected effect; none for a peak whose
+        simulations all fail.
     """
-    numbered_starts = []
-    # If scores use derivatives of the simulator, few candidates are better than their score.
-    min_relative_score = (
-        MIN_RELATIVE_SCORE_EXACT if evaluator.has_linearisation else MIN_RELATIVE_SCORE
-    )
-    if fits_all and evaluator.has_linearisation:
-        max_count, min_relative_score = MAX_REFITS_THOROUGH, 0.0
     # 1. Ranked effects.
-    ranked_candidates = _rank_candidates(
-        scores,
-        max_count,
-        min_relative_score,
-        # If scores are less reliable, they only order the fits, and exclude no candidate.
-        includes_all=fits_all and not evaluator.has_linearisation,
-        simulated_candidates=_find_simulated_scores(evaluator, scores),
-    )
+    ranked_candidates = _select_candidates(evaluator, scores, max_count, fits_all)
+    # Each start has the number of its peak among those of its effect.
+    numbered_starts = []
     for i in ranked_candidates:
         name = scores.effects[i]
         # 2. Starting values.
@@ -133,6 +126,37 @@ def select_refit_starts(
     return _select_nearest_start(evaluator, noise, numbered_starts, run_share)
 
 
+def _select_candidates(
+    evaluator: RunEvaluator, scores: CandidateScores, max_count: int, fits_all: bool
+) -> list[int]:
+    """Return the indices of the effects to refit, the most promising first.
+
+    The limits depend on how reliable scores are. For robots without contacts
+    (`has_linearisation`), they use derivatives of the simulator, so that few candidates are better
+    than their score. For other systems, they are less reliable.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs.
+        scores: scores of all candidates about one model.
+        max_count: maximum number of candidates by their score, unless `fits_all`.
+        fits_all: True to return all candidates, or for robots the best `MAX_REFITS_THOROUGH`.
+    """
+    if not evaluator.has_linearisation:
+        min_relative_score = MIN_RELATIVE_SCORE
+    elif fits_all:
+        max_count, min_relative_score = MAX_REFITS_THOROUGH, 0.0
+    else:
+        min_relative_score = MIN_RELATIVE_SCORE_EXACT
+    return _rank_candidates(
+        scores,
+        max_count,
+        min_relative_score,
+        # Scores that are less reliable then only order the fits.
+        includes_all=fits_all and not evaluator.has_linearisation,
+        simulated_candidates=_find_simulated_scores(evaluator, scores),
+    )
+
+
 def _find_simulated_scores(evaluator: RunEvaluator, scores: CandidateScores) -> frozenset[int]:
     """Return the indices of the candidates of a robot that are scored by full simulation.
 
@@ -143,6 +167,7 @@ def _find_simulated_scores(evaluator: RunEvaluator, scores: CandidateScores) -> 
         evaluator: the runs, with all available effects.
         scores: scores of the candidates.
     """
+    # True for robots without contacts.
     if not evaluator.has_linearisation:
         return frozenset()
     # Imported here, because only robots need it.
@@ -178,8 +203,10 @@ def _rank_candidates(
         scores: scores of all candidates.
         max_count: maximum number of candidates by their score.
         min_relative_score: minimum score above the null level, as a fraction of the best one.
-        includes_all: whether to return all candidates, ordered by their scores.
-        simulated_candidates: candidates scored by full simulation, which are selected separately.
+        includes_all: whether to return all candidates, ordered by their scores; the other limits
+            are then ignored.
+        simulated_candidates: indices of the candidates scored by full simulation, which are
+            selected separately.
     """
     score_excess = scores.score - scores.null_quantiles
     ranked: list[int] = np.argsort(-score_excess, kind="stable").tolist()
@@ -187,6 +214,7 @@ def _rank_candidates(
         return ranked
     # 1. Best scores.
     linear = [i for i in ranked if i not in simulated_candidates]
+    # Without linear scores, every simulated score exceeds them.
     best_excess = score_excess[linear[0]] if linear else -np.inf
     selected = [i for i in linear if score_excess[i] >= min_relative_score * best_excess][
         :max_count
@@ -211,7 +239,8 @@ def add_effect_to_start(
     """Add an effect to the start of a fit, in place of the simpler effects that it contains.
 
     Both together would have no unique solution: Stribeck friction, for example, contains Coulomb
-    friction. What the simpler effects did is added to the coefficients of the new one.
+    friction. What the simpler effects did is added to the coefficients of the new one, and their
+    own coefficients become zero.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -226,6 +255,7 @@ def add_effect_to_start(
     theta = start.theta.copy()
     for simpler_effect in sorted(set(effect.contains) & set(start.effects)):
         simpler_slice = evaluator.coefficient_slices[simpler_effect]
+        # Coefficients with which the effect also does what the simpler one did.
         coefficients = effect.taking(coefficients, simpler_effect, theta[simpler_slice])
         theta[simpler_slice] = 0.0
     theta[evaluator.coefficient_slices[name]] = coefficients
@@ -258,8 +288,10 @@ def _predict_jacobian(
         directions are no derivatives but changes by one full size, and for effects with a shape
         coefficient, such as a frequency, which has no direction.
     """
+    # True for robots without contacts.
     if not evaluator.has_linearisation:
         return None
+    # The column of the directions for each scaling coefficient (index within the effect).
     column_by_coefficient = {
         direction_set.candidates[column].coefficient_index: column
         for column in group.column_indices
@@ -270,6 +302,7 @@ def _predict_jacobian(
     has_shape = any(evaluator.parameters[index].bounds[0] > 0 for index in coefficient_indices)
     if not column_by_coefficient or has_shape:
         return None
+    # Derivatives (R, T, C, k) by the k coefficients of the effect.
     jacobian = np.zeros((*direction_set.responses.shape[:3], len(coefficient_indices)))
     for coefficient_index, column in column_by_coefficient.items():
         jacobian[..., coefficient_index] = direction_set.responses[..., column]
@@ -305,10 +338,11 @@ def _list_start_coefficients(
         evaluator: evaluator, which has the bounds of the coefficients.
         direction_set: directions of all candidates about the model.
         group: the columns of `direction_set` that belong to the effect at one choice of its shape.
-        estimate: linear estimate of the coefficient of each direction of the group.
+        estimate: (m,) linear estimate of the coefficient of each of the m directions of the group.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     bounds = compute_coefficient_bounds(evaluator, name)
+    # All directions of the group have the same shape, so that the first one stands for them.
     first_probe = direction_set.candidates[group.column_indices[0]]
     # 1. One size.
     # A direction for one full size says nothing about other sizes.
@@ -348,7 +382,8 @@ def _select_nearest_start(
     """Simulate all starts, and return the nearest to the data for each score peak.
 
     Simulating a start costs much less than fitting it. A score peak is a model with one more effect
-    at one shape of the effect.
+    at one shape of the effect, such as one frequency. The nearest start has the smallest sum of
+    squared residuals in units of the noise.
 
     Args:
         evaluator: evaluator that simulates the recorded runs.
@@ -398,6 +433,7 @@ def generate_neighbouring_end_stops(
     """
     if evaluator.available_effects[name].coefficients[0].of == "stop":
         stiffness = coefficients[0]
+        # Stiffness as a fraction of the largest plausible one.
         bound_share = abs(stiffness) / list_coefficients(evaluator, name)[0].bounds[1]
         # Simulating a robot costs a hundred times as much, so fewer stops are tried.
         stiffness_factors, depth_shares = (
@@ -429,6 +465,7 @@ def generate_equal_travel_end_stops(
         coefficients: (k,) coefficients of the given end stop: the stiffness, positive for the upper
             and negative for the lower end of the range, then its position.
     """
+    # The effect is no end stop, or its stiffness is zero, so that it is off.
     if evaluator.available_effects[name].coefficients[0].of != "stop" or not coefficients[0]:
         return
     stiffness, position = coefficients[:2]
@@ -438,6 +475,7 @@ def generate_equal_travel_end_stops(
     for factor in REFIT_STIFFNESS_FACTORS:
         end_stop = coefficients.copy()
         end_stop[0] = factor * stiffness
+        # The depth of contact changes with the stiffness.
         end_stop[1] = turning_point - (turning_point - position) * factor**CONTACT_DEPTH_EXPONENT
         yield end_stop
 
@@ -466,7 +504,8 @@ def generate_event_times(
         midpoints = (stamps[1:] + stamps[:-1]) / 2.0
         grid_spacing = (clock_end - clock_start) / (EVENT_TIME_COUNT + 1)
         near_midpoints = midpoints[np.abs(midpoints - coefficients[i]) <= grid_spacing]
-        # At most MAX_EVENT_TIME_SUBDIVISIONS of them, equally spaced.
+        # At most MAX_EVENT_TIME_SUBDIVISIONS of them, equally spaced: the quotient is rounded up,
+        # and is 1 if there are none.
         stride = -(-near_midpoints.size // MAX_EVENT_TIME_SUBDIVISIONS) or 1
         for instant in near_midpoints[::stride].tolist():
             moved_coefficients = coefficients.copy()
@@ -529,5 +568,5 @@ def _shift_frequency_or_time(
         elif is_period(parameter, travel) and value > 0:
             frequency = 1.0 / value + cycles / travel
             # Beyond the longest period, the frequency might become negative.
-            lowest = 1.0 / parameter.bounds[1]
-            yield 1.0 / max(frequency, lowest)
+            lowest_frequency = 1.0 / parameter.bounds[1]
+            yield 1.0 / max(frequency, lowest_frequency)

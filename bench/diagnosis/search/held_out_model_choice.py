@@ -66,12 +66,13 @@ class HeldOutValidation:
 
         Args:
             names: effects of a model that has been evaluated.
-            sigma: (C,) noise; None for the noise of the runs.
+            sigma: (C,) noise of each channel; None for the noise of the runs.
         """
         runs = self.runs
         noise = runs.noise.sigma if sigma is None else sigma
         residual = runs.evaluator.observed - self.held_out_fits[names].simulated
         scaled = residual / noise
+        # The mask `seen` selects the recorded samples.
         squares = np.square(scaled[runs.seen])
         return float(np.sqrt(squares.mean())) - 1.0
 
@@ -87,6 +88,7 @@ class HeldOutValidation:
             model: fitted model whose effects are tested.
         """
         while model.effects and model.effects in self.held_out_fits:
+            # Models that lack one effect of the model.
             submodels = self._list_smaller_models(search, model)
             better_submodels = [
                 smaller_model
@@ -114,11 +116,17 @@ class HeldOutValidation:
         Args:
             search: search with all fitted models.
             model: best model of the search, which has been evaluated on held-out runs.
+
+        Returns:
+            The best extension, without effects that do not help on held-out runs; the given model
+            if no extension is clearly better, or if none of its further effects helps.
         """
         names = set(model.effects)
+        # Of the models that contain all effects of the model, those that fit the runs best.
         extensions = [m for m in search.models.values() if names < set(m.effects)]
         extensions = sorted(extensions, key=lambda m: m.fit.cost)[:MAX_RICHER_MODELS]
         fitted_models = search.models.values()
+        # They show which effects of an extension do not help.
         submodels = [
             m
             for m in fitted_models
@@ -151,6 +159,7 @@ class HeldOutValidation:
             model: model with fewer effects.
             larger: a model with all its effects and further ones.
         """
+        # Ratio of the excesses that all further effects must achieve together.
         required_ratio = MAX_PAIR_EXCESS_SHARE_OF_SINGLE ** (
             len(larger.effects) - len(model.effects)
         )
@@ -198,6 +207,7 @@ class HeldOutValidation:
             reduced_model: model without the effect.
             full_model: model with the effect.
         """
+        # Without the effect (before) and with it (after).
         before = self.held_out_fits[reduced_model.effects].penalised_log_likelihood
         after = self.held_out_fits[full_model.effects].penalised_log_likelihood
         excess_before = self.compute_excess_residual(reduced_model.effects)
@@ -209,7 +219,8 @@ class HeldOutValidation:
         fitted_excess_before = search.compute_excess_residual(reduced_model)
         fitted_excess_after = search.compute_excess_residual(full_model)
         # 2. Small improvement.
-        # Errors of a motion without feedback accumulate, whatever their cause.
+        # Errors of a motion without feedback accumulate, whatever their cause, so that a right
+        # effect may reduce the excess only a little.
         is_better = (
             after > before + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO and excess_after < excess_before
         )
@@ -232,11 +243,12 @@ class HeldOutValidation:
 
         Args:
             model: the model, which has been evaluated.
-            lack_of_fit: lack-of-fit test of the model: p-value and description.
+            lack_of_fit: lack-of-fit test of the model, which tells whether its residual on the
+                fitted runs has structure.
         """
         noise = self.runs.noise.sigma
-        # The residual of the fitted runs is noise if it has no structure. A channel without samples
-        # has none.
+        # The residual of the fitted runs is noise if it has no structure. The sigma of a channel
+        # without samples is NaN.
         if not lack_of_fit.has_structure:
             noise = np.maximum(noise, np.nan_to_num(model.likelihood.sigma))
         # The base model has no effects.

@@ -84,13 +84,14 @@ class JointHatForce(Force):
             c: (7, B, 1) coefficients: strength, index of the joint, index of the variable (`TIME`,
                 `POSITION`, `SPEED`), centre, half-width, index of the direction (`ALONG`,
                 `AGAINST`, `DRY`), and speed over which dry friction reverses.
-            moment: time and joint states of the batch.
+            moment: state of the batch: time t, positions x (B, J) and velocities v (B, J).
 
         Returns:
             Forces (B, J) at the joints, zero at all joints but one.
         """
         strength, joint, variable, centre, width, direction, reversal_speed = c
         active_elements = np.flatnonzero(strength[:, 0])
+        # The hat is off in all batch elements.
         if not active_elements.size:
             return np.zeros_like(moment.x)
         joint_index, variable_index, direction_index = (
@@ -101,7 +102,7 @@ class JointHatForce(Force):
         value = (moment.t, x, np.abs(v))[variable_index]
         # A hat that is off has zero width, which must not be a divisor.
         height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)
-        # Dry friction, whose sign changes smoothly.
+        # Dry friction, whose sign changes smoothly at the reversal speed.
         dry_direction = -v / (np.abs(v) + np.maximum(reversal_speed, 1e-9))
         # In the order of `ALONG`, `AGAINST` and `DRY`.
         force_direction = (np.ones_like(v), -v, dry_direction)[direction_index]
@@ -163,7 +164,8 @@ class HatForce(Force):
                 coordinates), centre, half-width, index of the direction (against the motion in
                 proportion to speed, against it as dry friction, then along each axis), and the
                 speed over which dry friction reverses.
-            moment: states of all batch elements at one time.
+            moment: state of the batch: time t, positions x (B, J), velocities v (B, J), and speed
+                (B, 1), the norm of v.
 
         Returns:
             Forces (B, J).
@@ -227,22 +229,29 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     """Test whether the residual of a fitted model has structure that no effect explains.
 
     1. Compare the size of the residual with the noise.
-    2. Test for an unmodelled force with a filter. If it finds none, this decides.
+    2. Test for an unmodelled force with a Kalman filter, if the model set has one. If it finds no
+       force, this decides.
     3. Otherwise simulate hat-shaped forces over time, position and speed, and score them against
-       the residual, calibrated by surrogate residuals.
+       the residual. The scores are calibrated by surrogate residuals: random noise with the
+       spectrum of the residual.
 
     Args:
         models: fitted models of the recording.
         model: fitted model to test.
+
+    Returns:
+        The result; its p-value is 1 if no force was tested.
     """
     evaluator, is_noise_stated = models.evaluator, models.is_noise_stated
     # 1. Size.
     size_result = assess_residual_size(models, model)
+    # Without a hat force in the simulator, only the size is tested.
     if not any(probe.name in evaluator.coefficient_slices for probe in (HatForce, JointHatForce)):
         return size_result
     evaluator.search_control.report_and_check("an unmodelled force")
     # 2. Filter.
     force_test = models.score_unmodelled_force(model)
+    # Threshold of the p-value.
     level = get_structure_threshold(bool(is_noise_stated.all()))
     if force_test is not None:
         p_value, variable = force_test
@@ -253,6 +262,7 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
     # Scores need derivatives at the parameters of the model itself.
     model = models.refine_jacobian(model)
     directions = compute_hat_directions(evaluator, model)
+    # No hat changes the runs.
     if not directions.candidates:
         return size_result
     residual = models.compute_residual(model.fit)
@@ -286,6 +296,7 @@ def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResul
     sigma = model.likelihood.sigma
     # A channel without samples has no sigma and no residual.
     residual_sigma = np.where(np.isfinite(sigma), sigma, 0.0)
+    # Here the excess is the ratio to the noise floor, 1 for a residual that is only noise.
     excess = residual_sigma / models.noise.sigma
     channels = []
     for channel_index, name in enumerate(models.evaluator.channels):
@@ -309,6 +320,7 @@ def _compute_sigma_standard_error(models: ModelSet, model: FittedModel, channel:
     """
     # At a correlation of one, the formula diverges, and no channel would exceed its noise.
     phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
+    # A channel may have no samples, and must not be divided by zero.
     sample_count = max(int(models.observed_mask[:, :, channel].sum()), 2)
     relative_variance = (1.0 + phi * phi) / (1.0 - phi * phi) / (2.0 * sample_count)
     return float(np.sqrt(relative_variance))  # (2)
@@ -328,6 +340,7 @@ def compute_hat_directions(evaluator: RunEvaluator, model: FittedModel) -> Direc
         The K hats that change the runs, and the changes (R, T, C, K) per unit of their strength.
     """
     hats, strength = list_hat_probes(evaluator)
+    # Robots have a hat force of their own, which acts at one joint.
     is_robot = JointHatForce.name in evaluator.coefficient_slices
     effect_name = JointHatForce.name if is_robot else HatForce.name
     changes = compute_responses(
@@ -346,6 +359,13 @@ def list_hat_probes(evaluator: RunEvaluator) -> tuple[list[CandidateDirection], 
     A hat is a force that depends on one variable by a triangle. The hats of a family overlap and
     cover the range of their variable. They have the same label, because they form one hypothesis
     and act together.
+
+    Args:
+        evaluator: the recorded runs.
+
+    Returns:
+        The hats, each with the coefficients of `JointHatForce` (robots) or `HatForce`, and their
+        strength in the unit of a force.
     """
     strength = HAT_STRENGTH_SHARE * TYPICAL_FORCES[evaluator.simulator.system.kind]
     is_robot = JointHatForce.name in evaluator.coefficient_slices
@@ -354,6 +374,7 @@ def list_hat_probes(evaluator: RunEvaluator) -> tuple[list[CandidateDirection], 
         # With this spacing, each hat extends to the centres of its neighbours.
         width = (family.high - family.low) / (HAT_COUNT - 1)
         for centre in np.linspace(family.low, family.high, HAT_COUNT):
+            # In the order of the coefficients of the hat force.
             coefficients = np.array([strength, *family.variable, centre, width, *family.direction])
             probes.append(
                 CandidateDirection(
@@ -399,11 +420,13 @@ def _iterate_joint_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
     for joint, name, low, high in _iterate_positions(evaluator):
         speeds = np.abs(_compute_rates(evaluator, evaluator.channels.index(name)))
         speed = float(np.nanquantile(speeds, HIGH_SPEED_QUANTILE))
+        # Speed over which dry friction reverses its sign.
         reversal_speed = SIGN_CHANGE_SPEED_SHARE * speed
         duration = evaluator.longest_duration
         yield _HatFamily(
             f"time, along {name}", (joint, TIME), 0.0, duration, (ALONG, reversal_speed)
         )
+        # Texts of the directions for the labels.
         opposing_directions = {AGAINST: "against it", DRY: "dry"}
         if high > low:
             for direction, text in {ALONG: "along it", **opposing_directions}.items():
@@ -465,6 +488,7 @@ def _iterate_positions(evaluator: RunEvaluator) -> Iterator[tuple[int, str, floa
     """
     for axis, name in enumerate(evaluator.simulator.system.coordinates):
         if name in evaluator.channels:
+            # (R, T) positions; NaN where no sample exists.
             values = evaluator.observed[:, :, evaluator.channels.index(name)]
             low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
             yield axis, name, low, high

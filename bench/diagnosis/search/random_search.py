@@ -88,8 +88,9 @@ class RandomStartSearch:
             rng: random generator.
         """
         self._evaluator, self._sigma, self._rng = evaluator, sigma, rng
-        self._means = [one.mean for one in smoothed]
-        self._roots = [compute_root(one.covariance[None])[0] for one in smoothed]
+        self._means = [start.mean for start in smoothed]
+        # `compute_root` takes a batch of matrices; here a batch of one.
+        self._roots = [compute_root(start.covariance[None])[0] for start in smoothed]
         # Of each run: the best deviate so far (s,), and the covariance of the next deviates.
         self._deviates = [np.zeros(mean.size) for mean in self._means]
         self._covariances = [np.eye(mean.size) for mean in self._means]
@@ -107,11 +108,9 @@ class RandomStartSearch:
         4. Stop if the cost hardly decreases, or the runs are explained.
         5. Adapt the widths of the next samples to the best samples of this round.
 
-        Shapes: P parameters.
-
         Args:
-            theta: (P,) parameters.
-            indices: indices of the K coefficients that are varied.
+            theta: (P,) parameters, with the coefficients from which the search starts.
+            indices: indices in theta of the K coefficients that are varied.
             widths: (K,) standard deviations of these coefficients in the first round.
             bounds: (K, 2) lower and upper bounds of these coefficients.
         """
@@ -128,8 +127,10 @@ class RandomStartSearch:
             samples = np.repeat(theta[None], COEFFICIENT_SAMPLES, axis=0)
             samples[:, list(indices)] = values
             # 2. Initial states.
-            # For each run, the deviates and the costs of all initial states.
+            # For each run, the deviates (N, M, s) of M initial states for each of the N samples of
+            # the coefficients, and their costs (N, M).
             sampled_states = [self._sample_states(run, samples) for run in range(len(self._means))]
+            # Cost J(c) of each sample of the coefficients.
             totals = np.sum([costs.min(axis=1) for _, costs in sampled_states], axis=0)  # (1)
             # 3. Best sample.
             best, previous_lowest = int(np.argmin(totals)), lowest_cost
@@ -144,7 +145,7 @@ class RandomStartSearch:
                 break
             if not lowest_cost > EXPLAINED_SQUARES * sample_count:
                 break
-            # 5. Widths of the next round.
+            # 5. Widths of the next round, which do not increase.
             order = np.argsort(totals)[:BEST_COEFFICIENTS]
             deviation = np.sqrt(np.square(values[order] - centre).mean(axis=0))
             spread = np.minimum(spread, SPREAD_FACTOR * deviation)
@@ -155,6 +156,7 @@ class RandomStartSearch:
             for mean, root, deviate in zip(self._means, self._roots, self._deviates, strict=True)
         ]
         evaluator = self._evaluator
+        # Known states keep their values.
         states = np.where(evaluator.known_state_mask, evaluator.initial_state_guesses, best_states)
         return BestSample(best_theta, states, lowest_cost / max(sample_count, 1))
 
@@ -178,6 +180,7 @@ class RandomStartSearch:
             infinite cost.
         """
         mean, root = self._means[run], self._roots[run]
+        # N samples of the parameters, M initial states of each, s components.
         shape = (len(samples), STATE_SAMPLES, mean.size)
         spread = compute_root(self._covariances[run][None])[0]
         deviates = self._deviates[run] + self._rng.standard_normal(shape) @ spread.T

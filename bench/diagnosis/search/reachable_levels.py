@@ -34,6 +34,7 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
         One value for each member of the effect (a family has several).
     """
     effect = evaluator.available_effects[name]
+    # An effect that is no family is its own only member.
     members = members_of(effect)
     kind = effect.coefficients[0].of
     if kind == "give":
@@ -49,6 +50,7 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
         "error": _compute_max_servo_error,
         "level": _compute_max_level,
     }
+    # All other kinds are limits of the input itself.
     level_function = level_functions.get(kind, _get_largest_input)
     return np.array(
         [
@@ -67,6 +69,7 @@ def _get_command(run_data: RunData, effect: Effect) -> Array:
         run_data: recorded run, prepared for fitting: scenario and observed samples.
         effect: effect on an input.
     """
+    # Input signals (T,) of the run by name.
     signals = run_data.scenario.inputs
     zero_signal = np.zeros(run_data.scenario.times.size)
     first_signal = next(iter(signals.values()), zero_signal)
@@ -103,8 +106,8 @@ def _compute_max_input_acceleration(
 ) -> float:
     """Return the acceleration 4 d / t² that moves the input over its range d from rest to rest.
 
-    Half of t = `MIN_PROFILE_SECONDS` is acceleration, half braking. It is the largest acceleration
-    limit that is tried.
+    Half of the time t = `MIN_PROFILE_SECONDS` is acceleration, half braking. A faster motion is
+    hardly visible, so that this is the largest acceleration limit that is tried.
 
     Args:
         evaluator: unused; all level functions have the same arguments.
@@ -142,7 +145,8 @@ def _compute_max_level(evaluator: RunEvaluator, run_data: RunData, effect: Effec
 def _compute_max_servo_error(evaluator: RunEvaluator, run_data: RunData, effect: Effect) -> float:
     """Return the largest difference of command and position of a servo in a run.
 
-    It is zero if the position is not recorded. The position is multiplied by the gear ratio first.
+    It is zero if the position is not recorded. The position of the joint is multiplied by the gear
+    ratio first, because the command is in units of the motor's travel.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -150,6 +154,7 @@ def _compute_max_servo_error(evaluator: RunEvaluator, run_data: RunData, effect:
         effect: effect on the command of the servo.
     """
     system = evaluator.simulator.system
+    # Index of the coordinate on which the effect acts.
     place = system.primary if effect.coordinate is None else effect.coordinate
     name = system.coordinates[place]
     if name not in evaluator.channels:

@@ -136,7 +136,8 @@ def compute_explained_squares(
     This is the largest h'G^-1 h of any subset of the group's columns. A constrained coefficient is
     fixed at zero if it would be negative. The constrained least-squares solution is the
     unconstrained solution of some subset of columns, so all subsets are tried (C. L. Lawson, R. J.
-    Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    Hanson, Solving Least Squares Problems, 1974, chapter 23). Groups with more than
+    `MAX_COLUMNS_FOR_SUBSETS` columns are solved without sign constraints.
 
     Args:
         gram: (n, k, k) inner products G = <D, D> of the k directions of each of n groups.
@@ -147,12 +148,14 @@ def compute_explained_squares(
         The explained sums of squares (n, S), and the coefficients (n, k) for the first residual.
     """
     group_count, column_count, residual_count = cross.shape
+    # There are too many subsets of large groups, such as families at many joints.
     if column_count > MAX_COLUMNS_FOR_SUBSETS:
         return _solve_unconstrained(gram, cross)
     best = np.zeros((group_count, residual_count))
     coefficients = np.zeros((group_count, column_count))
     remaining_groups = np.arange(group_count)
-    # Most effects have no constraint, and then all columns together explain most.
+    # Most effects have no constraint, and then all columns together explain most. Groups without a
+    # unique solution remain.
     if not any(positive):
         solution = _solve_subset(gram, cross, list(range(column_count)))
         best[solution.groups] = solution.gain
@@ -169,7 +172,8 @@ def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> t
     """Find, for each group and residual, the subset of columns that explains most.
 
     A subset counts only if its constrained coefficients are not negative. The explained sum of
-    squares of a subset is h'G^-1 h, with G and h of its columns.
+    squares of a subset (`gain`) is h'G^-1 h, with G and h of its columns. It is zero if no subset
+    counts.
 
     Args:
         gram: (n, k, k) inner products G of the k directions of each of n groups.
@@ -184,6 +188,7 @@ def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> t
     coefficients = np.zeros((group_count, column_count))
     for subset in _enumerate_subsets(column_count):
         solution = _solve_subset(gram, cross, subset)
+        # Positions within the subset of the columns whose coefficients must not be negative.
         constrained = [j for j, column in enumerate(subset) if positive[column]]
         previous_best = best[solution.groups]
         # More columns must explain more than rounding error, otherwise the smaller subset is kept.
@@ -210,10 +215,11 @@ class _SubsetSolution(NamedTuple):
     """Least-squares solution for a subset of columns.
 
     Attributes:
-        groups: (m,) indices of the groups in which the columns are neither absorbed nor collinear.
-        gain: (m, S) h'G^-1 h.
-        scaled: (m, k, S) G^-1 h in units of the lengths of the columns.
-        coefficients: (m, k) G^-1 h of the first residual.
+        groups: (g,) indices of the groups in which the m columns are neither absorbed nor
+            collinear.
+        gain: (g, S) h'G^-1 h, the sum of squares that the columns explain of each residual.
+        scaled: (g, m, S) G^-1 h for columns of unit length.
+        coefficients: (g, m) G^-1 h of the first residual.
     """
 
     groups: Indices
@@ -225,35 +231,43 @@ class _SubsetSolution(NamedTuple):
 def _solve_subset(gram: Array, cross: Array, subset: list[int]) -> _SubsetSolution:
     """Solve the normal equations G c = h of each group for a subset of its columns.
 
-    Groups whose columns are zero or collinear have no unique solution and are left out; a smaller
-    subset of their columns explains the same. Columns are scaled to unit length, so that
-    collinearity does not depend on units.
+    Groups in which such a column is zero, or the columns are collinear, have no unique solution and
+    are left out; a smaller subset of their columns explains the same. Columns are scaled to unit
+    length, so that collinearity does not depend on units.
 
     Args:
-        gram: G (n, k, k), as in `compute_explained_squares`.
-        cross: h (n, k, S), as in `compute_explained_squares`.
-        subset: indices of the columns.
+        gram: (n, k, k) inner products G = <D, D> of the k directions D (columns) of each of n
+            groups.
+        cross: (n, k, S) inner products h = <D, e> of the directions with S residuals e.
+        subset: indices of the m columns to use, below k.
+
+    Returns:
+        Solution of the groups that have a unique one, with the sum of squares h'c of each residual
+        that the columns explain (`gain`).
     """
-    products = gram[:, subset][:, :, subset]
+    products = gram[:, subset][:, :, subset]  # (n, m, m)
     lengths = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
+    # Indices of the groups without a column of zeros, whose columns can be scaled.
     nonzero_groups = np.flatnonzero((lengths > 0).all(axis=1))
-    scale = lengths[nonzero_groups][:, :, None]
-    normal = products[nonzero_groups] / scale / scale.transpose(0, 2, 1)
-    # Collinear columns have no unique solution, and a smaller subset explains the same.
-    has_full_rank = np.linalg.eigvalsh(normal)[:, 0] >= RANK_TOLERANCE
-    solvable = nonzero_groups[has_full_rank]
-    scale = scale[has_full_rank]
-    right_hand_side = cross[solvable[:, None], subset] / scale
+    nonzero_lengths = lengths[nonzero_groups]
+    scaled_products = (
+        products[nonzero_groups] / nonzero_lengths[:, :, None] / nonzero_lengths[:, None, :]
+    )
+    # Of these, the groups whose columns are not collinear. Eigenvalues are in ascending order.
+    has_full_rank = np.linalg.eigvalsh(scaled_products)[:, 0] >= RANK_TOLERANCE
+    solvable_groups = nonzero_groups[has_full_rank]
+    scale = nonzero_lengths[has_full_rank][:, :, None]
+    right_hand_side = cross[solvable_groups[:, None], subset] / scale
     # With hundreds of right-hand sides, inverses are faster, and these matrices have unit
     # diagonals.
-    scaled = np.linalg.inv(normal[has_full_rank]) @ right_hand_side
-    gain = np.einsum("nks,nks->ns", scaled, right_hand_side)
+    scaled_solution = np.linalg.inv(scaled_products[has_full_rank]) @ right_hand_side
+    gain = np.einsum("nks,nks->ns", scaled_solution, right_hand_side)
     return _SubsetSolution(
-        groups=solvable,
+        groups=solvable_groups,
         gain=gain,
-        scaled=scaled,
+        scaled=scaled_solution,
         # For the first residual, in the units of the columns.
-        coefficients=scaled[:, :, 0] / scale[:, :, 0],
+        coefficients=scaled_solution[:, :, 0] / scale[:, :, 0],
     )
 
 
@@ -378,23 +392,26 @@ class ScoreTest:
         """Score each candidate effect by how much of the residual its sensitivities explain.
 
         The score of an effect is twice its gain in log-likelihood, eq. (4) of the module docstring.
-        Surrogate residuals contain no effect: their scores show which scores noise alone reaches.
+        It is the maximum over a grid of AR(1) correlations phi of the noise. Surrogate residuals
+        are random noise that contains no effect: their scores show which scores noise alone
+        reaches.
 
         Shapes: R runs, T samples, C channels.
 
         Args:
             residual: (R, T, C) residual of the model, zero where no sample exists.
             surrogate: (S, R, T, C) surrogate residuals for the null hypothesis; None to omit the
-                p-value.
+                p-value, which is then 1.
         """
         # The residual comes first, and is scored with the same products as the surrogates.
         surrogates = np.zeros((0, *residual.shape)) if surrogate is None else surrogate
-        table = _BestScores(self._groups, 1 + len(surrogates), self._count)
+        table = _BestScores(self._groups, residuals=1 + len(surrogates), count=self._count)
         products = InnerProducts(self._design, residual[None], surrogates)
         # The sums of products from one pass over the samples serve every correlation of the grid.
         for phi, determinant in self._determinants.items():
             total, grams, cross = products.project(phi)
             table.begin_correlation(phi, determinant, total)
+            # Each batch has the groups with the same number of columns and sign constraints.
             for batch, gram in zip(self._batches, grams, strict=True):
                 table.add_batch(
                     batch, *compute_explained_squares(gram, cross[batch.columns], batch.positive)
@@ -512,7 +529,8 @@ class _BestScores:
             coefficients: (n, k) coefficients of the groups for the first residual, the observed
                 one.
         """
-        # Best group of each effect: groups are sorted by effect, and reduced effect by effect.
+        # Best group of each effect: groups are sorted by effect, so that the groups of an effect
+        # are neighbours, and `reduceat` takes the maximum over each effect.
         effect_rows = self._effect_rows[batch.group_indices]
         order = np.argsort(effect_rows, kind="stable")
         batch_rows, first_of_effect = np.unique(effect_rows[order], return_index=True)
@@ -556,6 +574,7 @@ class _BestScores:
         p-value is the probability that the best score of a surrogate, relative to the 90 % quantile
         of its effect, is at least the observed one (5).
         """
+        # (E, S): the observed residual first, then the surrogates.
         gains = self._best_log_likelihoods - self._best_without_effects  # (4)
         observed = gains[:, 0]
         surrogate_gains = gains[:, 1:]
@@ -605,7 +624,8 @@ class _BestScores:
         if has_many_shapes:
             # Neighbours of the best group give the same result, so only local maxima count.
             padded = np.concatenate([[-np.inf], values, [-np.inf]])
-            is_peak = (values >= padded[:-2]) & (values >= padded[2:])
+            previous_values, next_values = padded[:-2], padded[2:]
+            is_peak = (values >= previous_values) & (values >= next_values)
         order = np.argsort(-values, kind="stable")
         max_peaks = STARTS_PER_EFFECT if has_many_shapes else 1
         peak_groups = [group_indices[i] for i in order if is_peak[i]][:max_peaks]
@@ -619,10 +639,10 @@ class _BestScores:
 def estimate_tail_p_value(null_values: Array, observed: Array) -> float:
     """Return the p-value of the largest observed score, eq. (5) of the module docstring.
 
-    It is the probability that the largest score of a surrogate, which contains no effect, is at
-    least as large. Probabilities below one in the number of surrogates are extrapolated: beyond the
-    most extreme fifth of the surrogates, the tail is assumed to be exponential, as that of a
-    likelihood ratio is.
+    It is the probability that the largest score of a surrogate (random noise that contains no
+    effect) is at least as large. Probabilities below one in the number of surrogates are
+    extrapolated: beyond the most extreme fifth of the surrogates, the tail is assumed to be
+    exponential, as that of a likelihood ratio is.
 
     Args:
         null_values: (E, S) scores of E effects for S surrogates; the maximum over E is compared.
@@ -630,6 +650,7 @@ def estimate_tail_p_value(null_values: Array, observed: Array) -> float:
     """
     if not observed.size:
         return 1.0
+    # Largest score of each surrogate, in ascending order.
     null_maxima = np.sort(null_values.max(axis=0))
     observed_maximum = float(observed.max())
     surrogate_count = null_maxima.size
@@ -641,6 +662,7 @@ def estimate_tail_p_value(null_values: Array, observed: Array) -> float:
     if observed_maximum <= tail_begin or surrogate_count < MIN_SURROGATES_FOR_TAIL:
         # The residual counts as one of the surrogates, so the p-value is never zero.
         return (1.0 + exceedance_count) / (1.0 + surrogate_count)
-    # The scale of an exponential distribution is its mean excess over the threshold.
+    # The scale of an exponential distribution is its mean excess over the threshold. It is zero if
+    # all values of the tail are equal, and must not be a divisor then.
     mean_excess = max(float((tail - tail_begin).mean()), 1e-9)
     return float(TAIL_SHARE * np.exp(-(observed_maximum - tail_begin) / mean_excess))

@@ -108,7 +108,9 @@ class ScoredModelSet(ModelSet):
 
         If the base model was replaced by a better fit, these are the scores about its previous fit.
         """
+        # The base model has no effects.
         key: frozenset[str] = frozenset()
+        # The scores about the present fit, or None if there are none about any fit.
         if key in self.scores_by_effects or key not in self.superseded_scans:
             return self.scores_by_effects.get(key)
         return self.superseded_scans[key].scores
@@ -148,7 +150,9 @@ class ScoredModelSet(ModelSet):
             noise_residual: (R, T, C) residual whose spectrum the surrogates have; None for that of
                 the model.
         """
+        # Models and their scores are stored by the set of their effects.
         key = frozenset(model.effects)
+        # New surrogates need the directions, which are stored with the scan.
         if key not in (self.scores_by_effects if noise_residual is None else self.cached_scans):
             self._score_models([model])
         if noise_residual is None:
@@ -181,6 +185,7 @@ class ScoredModelSet(ModelSet):
             models: models to score.
             other_kept_models: further models whose stored results must not be removed.
         """
+        # One entry for each model whose directions must be simulated.
         scan_arguments, keys, effect_counts = [], [], []
         for model in models:
             self._report_scoring(model)
@@ -190,7 +195,7 @@ class ScoredModelSet(ModelSet):
             rng = self.make_rng("library", model.effects)
             # 1. Directions of a fit that was replaced.
             previous_scan = self.superseded_scans.pop(key, None)
-            # A model that has hardly moved keeps its directions.
+            # A model that has hardly moved keeps its directions; only its residual is scored anew.
             if (
                 previous_scan is not None
                 and self._compute_fit_distance(previous_scan.fit, model.fit) < UNCHANGED_FIT_SIGMAS
@@ -222,6 +227,7 @@ class ScoredModelSet(ModelSet):
             self.evaluator.search_control.begin_stage(
                 f"testing {max(effect_counts)} effects{further_text}", len(scan_arguments)
             )
+        # The workers return the results in any order.
         scans = {}
         for model_index, scan in self.evaluator.worker_pool.map_unordered(
             self.evaluator, _scan_model, scan_arguments
@@ -249,8 +255,10 @@ class ScoredModelSet(ModelSet):
         memory. Those of the base model (the empty key) and of the models `kept_keys` are needed
         next; they are never removed, and those of the base model are not counted.
         """
-        # Directions about replaced fits are removed first.
+        # Directions about replaced fits are removed first. A dictionary has its oldest entries
+        # first.
         for cache in (self.superseded_scans, self.cached_scans):
+            # An empty key is the base model.
             for key in [k for k in cache if k and k not in kept_keys]:
                 cached_entries = [*self.superseded_scans.items(), *self.cached_scans.items()]
                 size = sum(scan.directions.responses.nbytes for k, scan in cached_entries if k)
@@ -277,8 +285,8 @@ class ScoredModelSet(ModelSet):
         """
         self.scores_by_effects[key] = scores
         self.best_p_values[key] = scores.p_value
-        # Kept from the first scores, so that models fitted before and after a better base fit can
-        # be compared.
+        # The key of the base model is empty. Its first scores are kept, so that models fitted
+        # before and after a better base fit can be compared.
         if not key and not self.null_gains:
             self.null_gains = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
 
@@ -321,14 +329,17 @@ class ScoredModelSet(ModelSet):
         Args:
             beam: models to extend (the best ones of the beam search).
             max_count: maximum number of candidates per model.
-            fits_all: whether to include all candidates, also those that were fitted before, and to
-                fit the beginnings of the runs first.
+            fits_all: whether to include all candidates, also those that were fitted before. There
+                are many, so that the beginnings of the runs are fitted first, and only the best
+                models are fitted to whole runs.
         """
         starts = self._collect_extension_starts(beam, max_count, fits_all)
+        # Only robots have a linearisation.
         if not self.evaluator.has_linearisation or fits_all:
             if starts:
                 self.refit_models(starts, is_staged=fits_all)
             return
+        # Models that are fitted now or were fitted before, as sets of effects.
         known_models = {frozenset(start.effects) for start in starts} | set(self.models)
         # Each start with its models in which a simpler law replaces one of its laws.
         starts_and_simpler = [
@@ -352,13 +363,13 @@ class ScoredModelSet(ModelSet):
     ) -> list[FitStart]:
         """Return starts of fits of each model of the beam with one more effect.
 
-        Starting values of the effect are those with the best score. Models whose scores are not
-        stored are scored first.
+        Starting values of the effect are those with the best score. Models whose directions are not
+        stored are scored first. Directions are the responses of the runs to the missing effects.
 
         Args:
             beam: the models to extend.
             max_count: maximum number of effects that are tried with each model.
-            fits_all: whether to include candidates that were fitted before.
+            fits_all: whether to include all effects, also those that were fitted before.
         """
         starts = []
         models = list(beam)
@@ -394,6 +405,7 @@ class ScoredModelSet(ModelSet):
         stored_model = self.models.get(frozenset(start.effects))
         if stored_model is None:
             return True
+        # A model with more effects can fit at least as well. Only robots have a linearisation.
         likelihood_deficit = model.likelihood.value - stored_model.likelihood.value
         return self.evaluator.has_linearisation and likelihood_deficit > NESTED_MODEL_TOLERANCE
 
@@ -437,6 +449,7 @@ class ScoredModelSet(ModelSet):
             model: model with fewer effects.
             larger: model with more effects.
         """
+        # Gain in twice the log-likelihood.
         gain = larger.likelihood.value - model.likelihood.value
         # The given model may be a refit, while the scores belong to the fit of the search.
         model = self.models[frozenset(model.effects)]
@@ -458,14 +471,15 @@ class ScoredModelSet(ModelSet):
         first.
 
         Args:
-            scores: scores about the smaller model.
+            scores: scores of the effects that the smaller model lacks, with those of surrogates.
             larger: model with more effects.
-            gain: gain in twice the log-likelihood.
+            gain: gain of the larger model in twice the log-likelihood.
         """
         null_quantiles = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
         # Among several effects, the highest null-hypothesis level is used.
         effect_null_quantiles = [null_quantiles.get(name, 0.0) for name in larger.effects]
         null_quantile = max(effect_null_quantiles, default=0.0)
+        # From the scores of the surrogates (`null_scores`), these quantiles are subtracted as well.
         excess = np.array([gain - null_quantile])
         return estimate_tail_p_value(scores.null_scores, excess)
 
@@ -495,6 +509,7 @@ class ScoredModelSet(ModelSet):
            floor is estimated for white noise, so AR(1) noise may exceed it (see
            `verdict_rules.exceeds_noise`).
         """
+        # Without a sigma (NaN), a channel counts as above the noise.
         residual_sigma = np.nan_to_num(model.likelihood.sigma, nan=np.inf)
         # 1. At the noise floor.
         is_above_noise = residual_sigma >= NOISE_RATIO_THRESHOLD * self.noise.sigma

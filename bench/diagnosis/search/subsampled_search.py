@@ -55,6 +55,7 @@ def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
         long as an engine step, or if a channel would lose too many samples.
     """
     total = int(evaluator.lengths.sum())
+    # Of each run, every n-th sample is kept; n is its factor.
     max_factor = total // MIN_THINNED_SAMPLES
     factors = [min(_compute_factor(run), max_factor) for run in evaluator.runs]
     if total < MIN_SAMPLES_TO_THIN or max(factors) < 2:
@@ -111,8 +112,9 @@ def _average_input(times: Array, values: Array, kept: Indices) -> Array:
     durations = np.diff(times, append=times[-1])
     # The last sample has no duration; a tiny one avoids 0 / 0 if it is a kept sample.
     durations[-1] = 1e-9 * max(float(times[-1] - times[0]), 1e-9)
-    # Sums from each kept sample to the next one.
-    means: Array = np.add.reduceat(values * durations, kept) / np.add.reduceat(durations, kept)
+    # `reduceat` sums from each kept sample to the next one, exclusive.
+    weighted_sums = np.add.reduceat(values * durations, kept)
+    means: Array = weighted_sums / np.add.reduceat(durations, kept)
     return means
 
 
@@ -171,6 +173,14 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
     2. Search on the subsampled runs.
     3. Fit the models that matter to all samples, and select the best.
     4. If all samples show more effects, repeat the search on them.
+
+    Args:
+        search: search on all samples, with the fitted base model.
+        thinned_runs: the same runs with fewer samples.
+
+    Raises:
+        SearchStoppedError: the search had to end early; the best model so far is stored in
+            `search`.
     """
     # 1. No effect.
     # The scores of the base model are needed in any case, to penalise effects with many shapes. If
@@ -178,15 +188,15 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
     if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
         return search.run()
     # 2. Subsampled runs.
-    rng = search.make_rng("fewer samples")
-    search_arguments = (
+    subsampled_search = EffectSearch(
         thinned_runs,
-        search.noise,
-        search.fixed_parameters,
-        rng,
-        search.is_noise_stated,
+        noise=search.noise,
+        fixed_parameters=search.fixed_parameters,
+        rng=search.make_rng("fewer samples"),
+        is_noise_stated=search.is_noise_stated,
+        thorough=search.thorough,
     )
-    subsampled_search = EffectSearch(*search_arguments, thorough=search.thorough)
+    # The base model, which every search needs.
     subsampled_search.refit_models([search.base_model.fit.make_start()])
     try:
         subsampled_model = refine_best_model(subsampled_search, subsampled_search.run())
@@ -201,6 +211,7 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
     # 4. Confirmation.
     if not _is_confirmed_by_all_samples(search, model):
         return search.run()
+    # The model was compared with its neighbours on the subsampled runs, which need not be repeated.
     search.settled_effects = frozenset(model.effects)
     search.best_supported_model = model
     return model
@@ -209,7 +220,7 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
 def _adopt_subsampled_models(search: EffectSearch, model: FittedModel) -> None:
     """Adopt the best model of a search on thinned runs, which had to end early.
 
-    It is simulated on all samples without a fit, for which there is no time.
+    It is simulated on all samples without a fit (zero iterations), for which there is no time.
 
     Args:
         search: search on all samples, in which the model is stored.
@@ -251,8 +262,8 @@ def _collect_full_fit_starts(
 def _select_full_model(search: EffectSearch, subsampled_model: FittedModel) -> FittedModel:
     """Return the fit to all samples of the model that was found.
 
-    Near the noise, return the best model of its size, because thinned runs distinguish models less
-    well.
+    If its residual is near the noise, return the best model with as many effects, because thinned
+    runs distinguish models less well.
 
     Args:
         search: search on all samples, with the fits of the models that the thinned runs select.

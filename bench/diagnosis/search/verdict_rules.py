@@ -99,6 +99,7 @@ def is_motionless(
         (ranges < MIN_MOTION_SIGMAS * sigma).all()
         and (residual_sigma < MAX_RESIDUAL_SIGMAS_AT_REST * sigma).all()
     )
+    # All ranges are exactly zero.
     is_constant = not ranges.any()
     # A constant recording contains no information, whatever the model expects.
     return is_constant or (is_at_rest and not is_model_sensitive)
@@ -122,13 +123,14 @@ def exceeds_noise(excess: float, error: float, is_noise_stated: bool) -> bool:
     """Return whether the residual of a channel exceeds its noise significantly.
 
     Args:
-        excess: RMS residual in units of the noise floor.
+        excess: RMS residual of the channel divided by its noise floor; 1 is noise alone.
         error: relative standard error of this RMS.
         is_noise_stated: whether the recording specifies the noise; an estimated floor assumes white
             noise and may be several times too small.
     """
     if is_noise_stated:
         return excess > 1.0 + NOISE_TOLERANCE + EXCESS_STANDARD_ERRORS * error
+    # Autocorrelated noise may exceed an estimated floor by this factor.
     return excess > MAX_AUTOCORRELATED_NOISE_RATIO
 
 
@@ -241,7 +243,7 @@ def misses_held_out_gap(before: float, after: float) -> bool:
 
     In this case something acts there that the fitted runs do not show: the excess is too large, or
     too little of the excess of the base model is removed. The excess is the RMS residual in units
-    of the noise, minus one.
+    of the noise, minus one, so that it is 0 for a model that leaves only noise.
 
     Args:
         before: excess of the base model on held-out runs.
@@ -323,7 +325,7 @@ def decide_early_stop_verdict(
 
     Causes are accepted ("partial") if they were compared with their competing models and on
     held-out runs, so that only `OPTIONAL_QUESTIONS` are open, and if they explain the discrepancy.
-    Otherwise the verdict is "unknown".
+    Otherwise the verdict is "unknown". A better verdict would claim that nothing else is missing.
 
     Args:
         causes: number of causes found.

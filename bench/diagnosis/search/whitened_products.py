@@ -126,13 +126,15 @@ def add_cross_products(
 ) -> None:
     """Add the products of all columns of one set with all columns of another, over one segment.
 
-    These are the three sums of eq. (1) of the module docstring, from which the inner product of
-    whitened columns follows for any correlation.
+    For columns a and b, these are three sums over the samples t of the segment: of a_t b_t, of
+    a_t (b_t-1 + b_t+1), and of n_t a_t b_t with the number n_t of missing neighbours. The inner
+    product of whitened columns follows from them for any correlation (eq. (1) of the module
+    docstring).
 
     Args:
-        sums: sums to add to, in place.
-        first: columns of the first set.
-        second: columns of the second set.
+        sums: sums to add to, in place, (..., k, l) each.
+        first: k columns of the first set.
+        second: l columns of the second set.
         segment: section of a run, with its samples that lack neighbours.
     """
     sums.same_samples[...] += first.samples @ np.swapaxes(second.samples, -1, -2)
@@ -146,9 +148,12 @@ def add_cross_products(
 def add_self_products(sums: LaggedSums, columns: SegmentColumns, segment: RunSegment) -> None:
     """Add the product of each column with itself, over one segment.
 
+    For a column a, these are three sums over the samples t of the segment: of a_t^2, of
+    a_t (a_t-1 + a_t+1), and of n_t a_t^2 with the number n_t of missing neighbours.
+
     Args:
-        sums: sums to add to, in place.
-        columns: columns whose squares are summed.
+        sums: sums to add to, in place, (k,) each.
+        columns: k columns whose squares are summed.
         segment: section of a run, with its samples that lack neighbours.
     """
     sums.same_samples[...] += np.einsum("kn,kn->k", columns.samples, columns.samples)
@@ -209,13 +214,13 @@ class WhiteningDesign:
     ) -> None:
         """Sum the products of Jacobian and directions over all samples, for all correlations.
 
-        The sums have the three parts of eq. (1) and are combined for a given phi later.
-        `_jacobian_products` has the products of the derivatives by the q parameters and s initial
-        states with each other (R, q + s, q + s), `_direction_products` those with the K directions
-        (R, q + s, K), `_direction_squares` (K,) the squares of the directions, and
-        `_block_products` the products of directions that act together. `_missing_neighbours` (R, T,
-        C) counts the missing neighbours of each sample, and `_reduced_designs` caches the projected
-        design of each phi.
+        The sums have the three parts of eq. (1) and are combined for a given phi later. A *column*
+        is a signal over all samples: a derivative or a direction. `_jacobian_products` has the
+        products of the derivatives by the q parameters and s initial states with each other (R, q +
+        s, q + s), `_direction_products` those with the K directions (R, q + s, K),
+        `_direction_squares` (K,) the squares of the directions, and `_block_products` the products
+        of directions that act together. `_missing_neighbours` (R, T, C) counts the missing
+        neighbours of each sample, and `_reduced_designs` caches the projected design of each phi.
 
         Shapes: R runs, T samples, C channels.
 
@@ -232,6 +237,7 @@ class WhiteningDesign:
         self._directions = np.moveaxis(directions, 3, 0)
         self._weights = observed_mask / sigma
         self._missing_neighbours = count_missing_neighbours(observed_mask)
+        # q + s derivatives and K directions.
         size, runs, *_ = self._jacobian.shape
         count = len(self._directions)
         self._jacobian_products = LaggedSums.zeros(runs, size, size)
@@ -251,6 +257,7 @@ class WhiteningDesign:
         indices of its samples with missing neighbours, at which whitening differs.
         """
         direction_count, runs, length, channels = self._directions.shape
+        # Number of samples of a section.
         step = max(MAX_CHUNK_SIZE // (max(direction_count, 1) * channels), MIN_CHUNK_SAMPLES)
         for run in range(runs):
             for begin in range(0, length, step):
@@ -273,20 +280,29 @@ class WhiteningDesign:
         Args:
             values: (k, R, T, C) columns: derivatives, directions or residuals.
             segment: the section.
-            has_neighbours: whether neighbours are needed; otherwise they are zero.
+            has_neighbours: whether sums of neighbours are needed; otherwise they are zero.
+
+        Returns:
+            Columns (k, n) over the n = (end - begin) C samples of the section, all channels in one
+            row.
         """
         run, begin, end = segment.run, segment.begin, segment.end
         column_count = len(values)
         # Include one more sample on either side, if it exists, as a neighbour of the outermost
         # ones.
         first, last = (max(begin - 1, 0), end + 1) if has_neighbours else (begin, end)
+        # The slice may end beyond the run, which then has no further sample.
         extended_samples = values[:, run, first:last] * self._weights[run, first:last]
         samples = extended_samples[:, begin - first : end - first]
         neighbour_sums = np.zeros_like(samples)
         if has_neighbours:
-            # At an end of the run, the outermost sample has no neighbour on this side.
+            # Samples begin - 1 to end - 2. At the beginning of the run, sample begin - 1 does not
+            # exist, so that the first sample gets nothing.
             previous_samples = extended_samples[:, : end - first - 1]
-            neighbour_sums[:, samples.shape[1] - previous_samples.shape[1] :] += previous_samples
+            lacking_count = samples.shape[1] - previous_samples.shape[1]
+            neighbour_sums[:, lacking_count:] += previous_samples
+            # Samples begin + 1 to end. At the end of the run, sample `end` does not exist, so that
+            # the last sample gets nothing.
             next_samples = extended_samples[:, begin - first + 1 :]
             neighbour_sums[:, : next_samples.shape[1]] += next_samples
         # The shape is written out, because -1 is ambiguous if there are no rows.
@@ -306,6 +322,7 @@ class WhiteningDesign:
         Args:
             segment: section of a run, with its samples that lack neighbours.
         """
+        # Samples of the section, divided by the noise.
         jacobian_columns = self._weight_columns(self._jacobian, segment)
         direction_columns = self._weight_columns(self._directions, segment)
         # 1. Jacobian.
@@ -325,7 +342,8 @@ class WhiteningDesign:
         add_self_products(self._direction_squares, direction_columns, segment)
         # 3. Blocks.
         for block, block_sums in zip(self.blocks, self._block_products, strict=True):
-            # The square of a single column is already known.
+            # A row of a block (n, k) has the indices of k directions. The square of a single one is
+            # already known.
             if block.shape[1] > 1:
                 members = SegmentColumns(
                     direction_columns.samples[block],
@@ -346,8 +364,10 @@ class WhiteningDesign:
 
         Returns:
             Products of residuals with themselves (S,), with the Jacobian per run (R, q + s, S), and
-            of directions with residuals (K, S).
+            of the K directions with residuals (K, S). Each has the three sums of eq. (1), which
+            are combined for a correlation later.
         """
+        # q + s columns of the Jacobian, of the parameters and the initial states.
         unknown_count, runs, *_ = self._jacobian.shape
         residual_count = sum(len(array) for array in residuals)
         squares = LaggedSums.zeros(residual_count)
@@ -360,6 +380,7 @@ class WhiteningDesign:
                 *(np.concatenate(rows) for rows in zip(*parts, strict=True))
             )
             jacobian_columns = self._weight_columns(self._jacobian, segment)
+            # Only the second factor of a product needs the sums of its neighbours.
             direction_columns = self._weight_columns(
                 self._directions, segment, has_neighbours=False
             )
@@ -390,6 +411,8 @@ class WhiteningDesign:
         reduced_design = self.reduce(0.0)
         parameter_count = self._parameter_count
         weighted = self._jacobian * self._weights
+        # Products (R, q + s, S) of the derivatives by q parameters and s initial states with the
+        # residuals.
         shared = np.stack(
             [
                 _flatten(run_jacobian) @ _flatten(residuals[:, run] * self._weights[run]).T
@@ -397,7 +420,7 @@ class WhiteningDesign:
             ]
         )
         by_states, by_parameters = _project_residuals(reduced_design, shared)
-        # 2. Coefficients.
+        # 2. Coefficients: parameters (q, S), and initial states (R, s, S).
         parameters = reduced_design.parameter_root @ by_parameters
         state_products = (
             by_states - reduced_design.state_projections[:, :parameter_count] @ parameters
@@ -427,9 +450,11 @@ class WhiteningDesign:
         """Whiten the design with the correlation phi, and project it by eq. (2).
 
         The design has the derivatives by parameters and initial states (J) and the directions of
-        effects. The products of two columns become a'b - (L'J'a)'(L'J'b), eq. (2), with L L' =
-        (J'J)^-1. So only the part of a direction that parameters and initial states cannot absorb
-        remains.
+        effects. The product of two columns a and b becomes a'b - (L'J'a)'(L'J'b), eq. (2), with
+        L L' = (J'J)^-1. So only the part of a direction that parameters and initial states cannot
+        absorb remains.
+
+        Shapes: R runs, q fitted parameters, s initial states of a run, K directions.
 
         1. Whiten all products with phi.
         2. Project out the initial states of each run, then the parameters of all runs.
@@ -444,7 +469,9 @@ class WhiteningDesign:
         mixed = self._direction_products.combine(phi)
         squares = self._direction_squares.combine(phi)
 
-        # 2. Projection: L'J'a of the initial states, then of the parameters.
+        # 2. Projection: L'J'a of the initial states, then of the parameters. Initial states belong
+        # to one run, parameters to all runs, so that products with parameters are summed over the
+        # runs.
         state_root = _compute_matrix_root(normal[:, parameter_count:, parameter_count:])
         other_products = np.concatenate(
             [normal[:, parameter_count:, :parameter_count], mixed[:, parameter_count:]], axis=2
@@ -452,6 +479,7 @@ class WhiteningDesign:
         by_states = _project_directions(state_root, other_products)
         by_parameters = by_states[:, :parameter_count]
         by_directions = by_states[:, parameter_count:]
+        # Products of the derivatives by the parameters, without what initial states absorb (q, q).
         schur_complement = (
             normal[:, :parameter_count, :parameter_count].sum(axis=0)
             - by_parameters.T @ by_parameters
@@ -463,6 +491,7 @@ class WhiteningDesign:
 
         # 3. Absorbed directions.
         # Only rounding remains of absorbed directions, which would explain residuals at random.
+        # L'J'a of all initial states and parameters (R s + q, K), whose squares are absorbed.
         absorbed = np.concatenate([by_directions, by_own_parameters])
         remaining = squares - np.einsum("ak,ak->k", absorbed, absorbed)
         acting = remaining > MIN_RESIDUAL_SHARE * squares
@@ -474,6 +503,7 @@ class WhiteningDesign:
             if block.shape[1] == 1:
                 grams.append(remaining[block][:, :, None])
                 continue
+            # (n, k, R s + q) for n groups of k directions.
             columns = np.moveaxis(absorbed[:, block], 0, 2)
             gram = block_sums.combine(phi) - columns @ columns.transpose(0, 2, 1)
             # Rounding makes the two halves differ, and the eigensolver reads only one of them.
@@ -513,9 +543,12 @@ class InnerProducts:
         """
         reduced_design = self._design.reduce(phi)
         parameter_count = len(reduced_design.parameter_root)
+        # L'J'e of the residuals e, for the initial states and the parameters.
         by_states, by_parameters = _project_residuals(reduced_design, self._shared.combine(phi))
         absorbed = np.concatenate([by_states, by_parameters])
         total = self._squares.combine(phi) - np.einsum("as,as->s", absorbed, absorbed)
+        # L'J'd of the directions d; the first columns of `state_projections` are those of
+        # parameters.
         direction_products = np.concatenate(
             [
                 reduced_design.state_projections[:, parameter_count:],
@@ -523,6 +556,7 @@ class InnerProducts:
             ]
         )
         cross = self._cross.combine(phi) - direction_products.T @ absorbed
+        # Rounding may make a sum of squares slightly negative; absorbed directions explain nothing.
         return (
             np.maximum(total, 0.0),
             reduced_design.grams,
@@ -585,6 +619,7 @@ def _compute_matrix_root(normal: Array) -> Array:
     Args:
         normal: (..., s, s) matrices J'J of the normal equations.
     """
+    # Without unknowns (s = 0), the root is empty, as the matrix is.
     if not normal.shape[-1]:
         return normal
     # Scale the columns to unit length, so that the cutoff does not depend on their units.
@@ -593,6 +628,7 @@ def _compute_matrix_root(normal: Array) -> Array:
     # A row of zeros remains zero, because it is divided by infinity.
     scale = np.where(lengths > 0, lengths, np.inf)[..., None]
     eigenvalues, eigenvectors = np.linalg.eigh(normal / scale / np.swapaxes(scale, -1, -2))
+    # Positive also for a matrix of zeros, of which no eigenvalue counts.
     largest = np.maximum(eigenvalues[..., -1:], 1e-300)
     is_counted = eigenvalues > RANK_TOLERANCE * largest
     inverse_roots = np.where(is_counted, 1.0 / np.sqrt(np.where(is_counted, eigenvalues, 1.0)), 0.0)
