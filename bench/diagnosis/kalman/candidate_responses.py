@@ -67,6 +67,7 @@ class SparseSignals:
     @classmethod
     def join(cls, parts: Sequence[SparseSignals]) -> SparseSignals:
         """Return the columns of all parts, one part after another."""
+        # Index of the first column of each part, and the number of all columns.
         *first_columns, count = np.cumsum([0, *(part.shape[1] for part in parts)]).tolist()
         columns = [part.columns + first for part, first in zip(parts, first_columns, strict=True)]
         return cls(
@@ -78,6 +79,7 @@ class SparseSignals:
 
     def expand(self, begin: int, end: int) -> SingleArray:
         """Return the signals (R, T, E, end - begin) of consecutive columns, zeros included."""
+        # The signals of these columns are consecutive, because columns are in ascending order.
         first, last = np.searchsorted(self.columns, [begin, end])
         dense = np.zeros((*self.values.shape[:2], self.shape[0], end - begin), dtype=np.float32)
         stored = slice(first, last)
@@ -85,7 +87,7 @@ class SparseSignals:
         return dense
 
     def total(self, columns: IndexArray, weights: Array) -> Array:
-        """Return the sum (R, T, E) of n columns, each times its weight.
+        """Return the weighted sum (R, T, E) of n columns, with R runs, T samples and E rows.
 
         Args:
             columns: (n,) indices of columns, which may occur several times.
@@ -122,17 +124,23 @@ class Columns:
 
     def joined(self, others: Columns) -> Columns:
         """Return the columns of these candidates, followed by those of others."""
+        # The columns of the others follow the present ones.
+        _, column_count = self.inputs.shape
         return Columns(
             self.probes + others.probes,
-            np.concatenate([self.column_indices, others.column_indices + self.inputs.shape[1]]),
+            np.concatenate([self.column_indices, others.column_indices + column_count]),
             np.concatenate([self.sizes, others.sizes]),
             SparseSignals.join([self.inputs, others.inputs]),
             SparseSignals.join([self.readings, others.readings]),
         )
 
     def iterate_batches(self) -> Iterator[ColumnBatch]:
-        """Iterate over the columns of the candidates, in batches that fit in the CPU cache."""
-        count = self.inputs.shape[1]
+        """Iterate over the columns of the candidates, in batches that fit in the CPU cache.
+
+        Several candidates may share a column. Each batch has consecutive columns, and the
+        candidates that have one of them. Batches without candidates are left out.
+        """
+        _, count = self.inputs.shape
         for begin in range(0, count, COLUMNS_PER_BATCH):
             end = min(begin + COLUMNS_PER_BATCH, count)
             candidates = np.flatnonzero(
@@ -165,7 +173,7 @@ class Columns:
 
         Args:
             chosen: (n,) indices of candidates.
-            coefficients: (n,) coefficient of each chosen candidate.
+            coefficients: (n,) scaling coefficient of each chosen candidate.
 
         Returns:
             Missing forces and changes of the controls (R, T - 1, E + nu), and changes ψ of the
@@ -195,21 +203,24 @@ class ColumnBatch(NamedTuple):
 def compute_columns(followed: FollowedRuns, probes: Sequence[CandidateDirection]) -> Columns:
     """Compute the inputs that candidates add to states and readings, once for equal candidates.
 
-    Candidates with the same effect and coefficients share a column. So do an effect at all places
-    (family) of which a single member acts, and this member alone. Columns with an infinite number
-    are set to zero, so that they explain nothing.
+    A column has the forces, controls and changes of readings that an effect with its trial
+    coefficients adds to the runs. Candidates with the same effect and coefficients share a column.
+    So do an effect at all places (family) of which a single member acts, and this member alone.
+    Columns with an infinite number are set to zero, so that they explain nothing.
 
     Args:
         followed: the runs, followed by the filter about whose motion the inputs are computed.
         probes: the candidates: effects with trial coefficients.
     """
+    # The effect of each column, with its coefficients.
     effects: list[tuple[Effect, Array]] = []
     column_by_key: dict[tuple[str, bytes], int] = {}
     column_indices = []
     for probe in probes:
         effect = followed.evaluator.available_effects[probe.effect]
         coefficients = probe.coefficients
-        # Members of a family, each with its part of the coefficients.
+        # Members of a family, each with its part of the coefficients (K, L, 1) of one batch element
+        # (L = 1); other effects are their own only part.
         acting_members = [
             (member, part)
             for member, part in effect.parts(coefficients[:, None, None])
@@ -224,12 +235,14 @@ def compute_columns(followed: FollowedRuns, probes: Sequence[CandidateDirection]
             column_by_key[key] = len(effects)
             effects.append((effect, coefficients))
         column_indices.append(column_by_key[key])
+    # Dense inputs of all columns together would need too much memory.
     batches = [
         _compute_inputs(followed, effects[begin : begin + COLUMNS_PER_BATCH])
         # An empty batch if there are no effects.
         for begin in range(0, max(len(effects), 1), COLUMNS_PER_BATCH)
     ]
     inputs, readings = (SparseSignals.join(parts) for parts in zip(*batches, strict=True))
+    # A candidate that is valid at one size only is not divided by it.
     sizes = np.array(
         [1.0 if p.is_single_size else p.coefficients[p.coefficient_index] for p in probes]
     )
@@ -241,26 +254,33 @@ def _compute_inputs(
 ) -> tuple[SparseSignals, SparseSignals]:
     """Compute the inputs that effects add to the states and to the readings.
 
+    Inputs are the forces and controls that an effect adds to the motion that the filter predicts.
+    Those of an effect with a value that is not finite are all zero.
+
     Args:
         followed: the runs, followed by the filter about whose motion the inputs are computed.
-        effects: effects with their coefficients; each has one column.
+        effects: m effects with their coefficients; each has one column.
 
     Returns:
-        Mean forces and controls between samples, and direct changes of the readings.
+        Mean forces and controls (R, T - 1, E + nu, m) between samples, and direct changes
+        (R, T, C, m) of the readings: R runs, T samples, E forces, nu controls, C channels.
     """
     run_count, samples, channels = followed.runs.residuals.shape
     input_count = followed.runs.inputs.shape[3]
     inputs = np.zeros((run_count, samples - 1, input_count, len(effects)), dtype=np.float32)
     readings = np.zeros((run_count, samples, channels, len(effects)), dtype=np.float32)
-    changes = compute_control_changes(followed.linear, effects)
-    for run, (linear, driven) in enumerate(zip(followed.linear, changes, strict=True)):
+    control_changes = compute_control_changes(followed.linear, effects)
+    for run, (linear, changes) in enumerate(zip(followed.linear, control_changes, strict=True)):
+        # Predicted deviations from the motion, without padding after the end of the run, and
+        # without states of coloured noise.
         predicted = followed.filtered.predicted[
             run, : linear.knots.size, : followed.runs.prior.size
         ]
-        run_inputs, run_readings = linear.added(effects, np.nan_to_num(predicted), driven)
+        run_inputs, run_readings = linear.added(effects, np.nan_to_num(predicted), changes)
         inputs[run, : run_inputs.shape[0]] = run_inputs
         readings[run, : run_readings.shape[0]] = run_readings
     readings[~followed.runs.recorded] = 0.0
+    # Mask (m,) of the effects.
     is_finite = np.isfinite(inputs).all(axis=(0, 1, 2)) & np.isfinite(readings).all(axis=(0, 1, 2))
     inputs[..., ~is_finite], readings[..., ~is_finite] = 0.0, 0.0
     return SparseSignals.from_dense(inputs), SparseSignals.from_dense(readings)
@@ -269,8 +289,11 @@ def _compute_inputs(
 def compute_responses(followed: FollowedRuns, columns: Columns, responses: SingleArray) -> None:
     """Compute how a unit of each candidate changes the whitened innovations of the filter.
 
-    The forces, controls and readings that a candidate adds are propagated through the recursion of
-    the filter, eq. (1) of the module docstring, with its gains.
+    A whitened innovation is the difference between a reading and its prediction by the filter, in
+    units of its standard deviation and uncorrelated with the others. The response is what a unit of
+    the candidate, if it acts on the robot, adds to the innovations of this filter, whose model
+    lacks it. The forces, controls and readings that the candidate adds are propagated through the
+    recursion of the filter, eq. (1) of the module docstring, with its gains.
 
     Args:
         followed: the R runs, followed by the filter.
@@ -279,18 +302,22 @@ def compute_responses(followed: FollowedRuns, columns: Columns, responses: Singl
             units of the candidates' coefficients; it is overwritten.
     """
     recursion = _FilterRecursion.of(followed)
+    # Responses of the states to unit forces and controls.
     input_matrices = followed.runs.inputs.astype(np.float32)
     for batch in columns.iterate_batches():
-        # Slices of consecutive candidates are written several times faster than single ones.
+        # Slices of consecutive candidates are written several times faster than single ones. So the
+        # candidates of the batch are split where their indices are not consecutive.
         breaks = np.flatnonzero(np.diff(batch.candidates) != 1) + 1
         parts = np.split(np.arange(batch.candidates.size), breaks)
         with np.errstate(all="ignore"):
             whitened = recursion.propagate(input_matrices @ batch.inputs, batch.readings)
             # One run at a time, because the arrays of all runs together exceed the CPU cache.
             for run, values in enumerate(whitened):
+                # Candidates that share a column have the same response, up to their trial size. All
+                # indices are valid, so that none is clipped.
                 scaled = np.take(values, batch.columns, axis=2, mode="clip")
                 scaled /= columns.sizes[batch.candidates].astype(np.float32)
-                # A candidate with a divergent motion gets a response of zero.
+                # A candidate with a divergent motion gets a response of zero, also for NaN.
                 scaled[~(np.abs(scaled) < MAX_MAGNITUDE)] = 0.0
                 for part in parts:
                     first, last = batch.candidates[part[[0, -1]]]
@@ -303,9 +330,9 @@ def compute_parameter_responses(
     """Return how a change of each parameter changes the whitened innovations of the filter.
 
     The model is linearised about the same motion, so that a change of a parameter changes the
-    defects of the motion (by how much a step misses the next state) and the predicted readings.
-    They pass through the filter as those of a candidate do, eq. (1) of the module docstring.
-    Jacobians, gains and process noise stay the same.
+    defects (the difference between the motion and the model's own steps) and the predicted
+    readings. These changes pass through the filter as those of a candidate do, eq. (1) of the
+    module docstring. Jacobians, gains and process noise stay the same.
 
     Args:
         followed: the R runs, followed by the filter.
@@ -327,13 +354,19 @@ def compute_parameter_responses(
         theta[index] += size
         for run, linear in enumerate(followed.linear):
             displaced = linearise_run(
-                *(followed.evaluator, theta, followed.noise, run, linear.trajectory, linear),
+                followed.evaluator,
+                theta,
+                followed.noise,
+                run,
+                trajectory=linear.trajectory,
+                neighbour=linear,
                 reuses_loads=True,
             )
-            defects, predicted = displaced.compute_changes(linear)
+            defect_changes, reading_changes = displaced.compute_changes(linear)
             with np.errstate(all="ignore"):
-                changes[run, : len(defects), :, column] = -defects / size
-                readings[run, : len(predicted), :, column] = predicted / size
+                # Defects are subtracted from the predicted states, hence the sign.
+                changes[run, : len(defect_changes), :, column] = -defect_changes / size
+                readings[run, : len(reading_changes), :, column] = reading_changes / size
     readings[~followed.runs.recorded] = 0.0
     # A step in which the model diverges gives no information on the next one.
     for values in (changes, readings):
@@ -361,17 +394,15 @@ def compute_sensitivities(
 
     Args:
         followed: the runs, with their linearised models.
-        columns: inputs of the candidates.
+        columns: inputs of the K candidates; several candidates may share a column.
         dtype: type of the result.
     """
     run_count, samples, channels = followed.runs.residuals.shape
     result = np.zeros((run_count, samples, channels, len(columns.probes)), dtype)
     for batch in columns.iterate_batches():
-        changes = followed.propagate_without_gain(
-            np.zeros((run_count, followed.runs.prior.size, batch.inputs.shape[3])),
-            batch.inputs,
-            batch.readings,
-        )
+        # The first states do not change.
+        no_changes = np.zeros((run_count, followed.runs.prior.size, batch.inputs.shape[3]))
+        changes = followed.propagate_without_gain(no_changes, batch.inputs, batch.readings)
         with np.errstate(all="ignore"):
             result[..., batch.candidates] = (
                 changes[..., batch.columns] / columns.sizes[batch.candidates]
@@ -395,7 +426,7 @@ class _FilterRecursion(NamedTuple):
 
     @classmethod
     def of(cls, followed: FollowedRuns) -> _FilterRecursion:
-        """Return the recursion of the filter of the R runs."""
+        """Return the recursion of the filter of the R runs, with states for coloured noise."""
         coloured, _ = add_noise_states(followed.runs, followed.noise)
         return cls(
             coloured.states.astype(np.float32),
@@ -409,16 +440,20 @@ class _FilterRecursion(NamedTuple):
         """Propagate columns through the filter, and return the whitened responses (R, T, C, m).
 
         The recursion is s[i+1] = A (s[i] - K u[i]) + b[i] with u = H s + ψ, where s is the change
-        of the predicted state and K the gain of the filter: part of a change of the state is
-        corrected by the next reading. The whitened response is W u. It is eq. (1) of the module
-        docstring, for all m columns in single precision.
+        of the predicted state, A the transition and H the observation matrix, and K the gain of the
+        filter: part of a change of the state is corrected by the next reading. The whitened
+        response is W u. It is eq. (1) of the module docstring, for all m columns in single
+        precision. Responses that diverge become zero.
+
+        Shapes: R runs, T samples, C channels, Z states of the robot.
 
         Args:
-            changes: b (R, T - 1, Z, m) of the states of the robot.
-            readings: ψ (R, T, C, m).
+            changes: b (R, T - 1, Z, m), which each column adds to the states of the robot.
+            readings: ψ (R, T, C, m), which each column adds to the readings.
         """
         samples = readings.shape[1]
         responses = np.zeros_like(readings)
+        # With further states for coloured noise.
         s = np.zeros((len(readings), self.states.shape[2], readings.shape[3]), dtype=np.float32)
         with np.errstate(all="ignore"):
             for i in range(samples):

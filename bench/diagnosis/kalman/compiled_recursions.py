@@ -44,11 +44,13 @@ def propagate_covariance(a: Array, p: Array, product: Array, out: Array) -> None
     `product` receives (a p)ᵀ = p aᵀ, for which `out` is used as a buffer. The lower triangle is
     copied from the upper one, so that the result is exactly symmetric.
     """
+    # product = (a p)ᵀ
     multiply_sparse(a, p, out)
     size = a.shape[0]
     for i in range(size):
         for j in range(size):
             product[j, i] = out[i, j]
+    # out = a (p aᵀ)
     multiply_sparse(a, product, out)
     for i in range(size):
         for j in range(i):
@@ -85,19 +87,22 @@ def run_filter(
 ) -> None:
     """Filter B runs of T samples with Z states, C channels and E forces (Kalman filter).
 
-    With δ- and P- the predicted deviation of the state and its covariance, each sample has
-    ((1) to (4) of `filter_and_smoother`)
+    The deviation δ of the state is that from the motion about which the model is linear. With δ-
+    and P- its prediction and the covariance of that, each sample has ((1) to (4) of
+    `filter_and_smoother`)
 
         e = r - H δ-,    S = H P- Hᵀ + R = L Lᵀ,    W = L⁻¹,    K = P- Hᵀ Wᵀ W
         log L -= log det L + |W e|² / 2
 
-    and an update by the reading and the prediction of the next sample after it, except the last:
+    After each sample but the last, the state is updated by the reading, and that of the next sample
+    is predicted:
 
         δ = δ- + K e,    P = P- - K S Kᵀ,    δ- = A δ - d,    P- = A P Aᵀ + G Q Gᵀ + J
 
     If a predicted covariance exceeds the limit, the state of an unstable motion is unknown, and its
-    covariance is reset to a wide prior. Results are written to `predicted` and the five arguments
-    after it; the last ten are buffers, so that no memory is allocated.
+    covariance is reset to a prior that is wider than that of the first state. Results are written
+    to `predicted` and the five arguments after it, which are zero at first; the last ten are
+    buffers, so that no memory is allocated.
 
     Args:
         states: A (B, T - 1, Z, Z).
@@ -141,9 +146,10 @@ def run_filter(
                 predicted[run, i, z] = x[z]
                 for y in range(size):
                     covariances[run, i, z, y] = p[z, y]
-            # crossed = H P; zeros of H are skipped.
+            # crossed = H P
             multiply_sparse(h, p, crossed)
-            # Cholesky factor L of S, its inverse W, and half = W H P
+            # S = H P Hᵀ + R (lower triangle, in `root`), and in place, row by row, its Cholesky
+            # factor L
             for c in range(channels):
                 for d in range(c + 1):
                     root[c, d] = variances[run, i, c] if c == d else 0.0
@@ -157,6 +163,7 @@ def run_filter(
                     for k in range(d):
                         value -= root[c, k] * root[d, k]
                     root[c, d] = np.sqrt(value) if c == d else value / root[d, d]
+            # W = L⁻¹ by forward substitution, and half = W H P
             for c in range(channels):
                 for d in range(c + 1):
                     value = 1.0 if c == d else 0.0
@@ -177,7 +184,7 @@ def run_filter(
                     whiteners[run, i, c, d] = inverse[c, d]
                 w[c] = value
                 total -= np.log(root[c, c]) + 0.5 * value * value
-            # K = halfᵀ W
+            # K = halfᵀ W; gains are zero at first.
             for z in range(size):
                 for c in range(channels):
                     factor = half[c, z]
@@ -204,7 +211,8 @@ def run_filter(
             for z in range(size):
                 x[z] = moved[z]
             propagate_covariance(a, p, work, spread)
-            lost = False
+            # Add J and G Q Gᵀ to the lower triangle, and copy it to both halves of P-.
+            is_lost = False
             for z in range(size):
                 spread[z, z] += jumps[run, i, z]
                 for e in range(count):
@@ -216,9 +224,10 @@ def run_filter(
                     value = spread[z, y]
                     p[z, y] = value
                     p[y, z] = value
+                    # `not` also finds NaN.
                     if not abs(value) < limits[0]:
-                        lost = True
-            if lost:
+                        is_lost = True
+            if is_lost:
                 for z in range(size):
                     for y in range(size):
                         p[z, y] = prior[z] * prior[z] + 1.0 if z == y else 0.0
@@ -259,8 +268,9 @@ def run_smoother(
         δ_i = δ- - P- λ_i,    f_{i-1} = - Q Gᵀ λ_i
 
     Sums of (Gᵀ λ)² and of the diagonal of Gᵀ Λ G over all runs are the numerator and denominator of
-    (7). Results are written to `smoothed` and the three arguments after it; the last ten are
-    buffers, so that no memory is allocated.
+    (7), the factor by which the variances Q of the missing forces must change. Results are written
+    to `smoothed` and the three arguments after it; the last ten are buffers, so that no memory is
+    allocated.
 
     Args:
         states: A (B, T - 1, Z, Z).

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.kalman.measured_states import estimate_measured_states
 from sims.core.simulator import Array
@@ -138,8 +139,9 @@ def smooth_first_states(
 ) -> list[SmoothedStart] | None:
     """Filter and smooth all runs with the likeliest missing force of each.
 
-    The missing force allows for an incomplete model. Several sizes of it are tried for each run,
-    and the result with the highest log-likelihood is returned.
+    The missing force, a random force at each joint that is constant between two samples (process
+    noise), allows for an incomplete model. Several sizes of it are tried for each run, and the
+    result with the highest log-likelihood is returned.
 
     Args:
         evaluator: the runs.
@@ -166,14 +168,15 @@ def smooth_first_states(
         for run in runs
     ]
     is_finite = all(
-        np.isfinite(one.mean).all() and np.isfinite(one.covariance).all() for one in best
+        np.isfinite(smoothed.mean).all() and np.isfinite(smoothed.covariance).all()
+        for smoothed in best
     )
     return best if is_finite else None
 
 
 def compute_first_deviations(smoothed: Sequence[SmoothedStart]) -> Array:
     """Return the standard deviations (2 D,) of first states, RMS over the runs."""
-    variances = [np.diag(one.covariance) for one in smoothed]
+    variances = [np.diag(run_start.covariance) for run_start in smoothed]
     deviations: Array = np.sqrt(np.mean(variances, axis=0))
     return deviations
 
@@ -198,6 +201,7 @@ def _refine_first_state(
         smoothed: result of the smoother for this run.
     """
     is_recorded = np.isfinite(evaluator.observed[run])
+    # A fixed seed, so that the result depends only on the arguments.
     rng = np.random.default_rng(0)
     root = compute_root(smoothed.covariance[None])[0]
     # Deviates are in units of the uncertainty: a state is mean + root @ deviates.
@@ -205,7 +209,7 @@ def _refine_first_state(
     width, lowest = 1.0, np.inf
     for _ in range(SEARCH_ROUNDS):
         tried = deviates + width * rng.standard_normal((SEARCHED_STATES, deviates.size))
-        # The first one is the best so far, whose residual decides whether the search goes on.
+        # The first one is the best so far, whose residual decides below whether the search goes on.
         tried[0] = deviates
         states = smoothed.mean + tried @ root.T
         simulated = evaluator.simulate(
@@ -240,6 +244,7 @@ def can_filter(evaluator: RunEvaluator, theta: Array) -> bool:
     robot, joints = simulator.robot, len(simulator.addresses.positions)
     acting = simulator.get_active_effects(theta[None])
     is_stepwise = any(is_evaluated_per_step(effect) for effect, _ in acting)
+    # `na` is MuJoCo's number of activations. Only joints with one coordinate have a position each.
     has_more_states = robot.compiled.na or len(robot.joints) != joints or robot.series
     return not (has_more_states or is_stepwise)
 
@@ -263,8 +268,10 @@ def filter_hypotheses(
     simulator = evaluator.simulator
     assert isinstance(simulator, RobotSimulator)
     points = count_cubature_points(len(simulator.addresses.positions))
+    # Number of hypotheses whose points fit in one batch of the engine.
     batch_size = max(LINEARISATION_BATCH_SIZE // points, 1)
-    active_effects = simulator.get_active_effects(np.array([one.theta for one in hypotheses]))
+    thetas = np.array([hypothesis.theta for hypothesis in hypotheses])
+    active_effects = simulator.get_active_effects(thetas)
     # Indices of the hypotheses that may share a batch, by added elements and sample times.
     groups: dict[tuple[int, bytes], list[int]] = {}
     for added_elements, indices in enumerate(
@@ -273,6 +280,7 @@ def filter_hypotheses(
         for index in indices:
             times = evaluator.prepared_runs[hypotheses[index].run].scenario.times
             groups.setdefault((added_elements, times.tobytes()), []).append(index)
+    # Results by index of the hypothesis.
     results: dict[int, SmoothedStart] = {}
     for group in groups.values():
         for first in range(0, len(group), batch_size):
@@ -292,9 +300,15 @@ class _CubatureFilters:
     ) -> None:
         """Compute the inputs over all steps, and find the recorded components of the state.
 
-        Each hypothesis gets its controls, forces, first state with prior, and readings. The first
-        state is the guess of the evaluator with velocities from the readings. The batch of the
-        engine gets the effects of each hypothesis once per cubature point.
+        Each hypothesis gets its controls, forces, first state with prior, and readings. The batch
+        of the engine gets the effects of each hypothesis once per cubature point.
+
+        For F hypotheses and D joints, `_start` and `_prior` (F, 2 D) are the guessed first states
+        and their standard deviations, `_controls` and `_forces` the inputs of each step, and
+        `_force_deviations` (F, D) the standard deviations of the missing forces. `_knots` (T,) are
+        the numbers of the steps at which the samples lie, `_observed` (F, T, m) the readings of the
+        m recorded components of the state, `_rows` the indices of these components, and
+        `_variances` (m,) their noise.
 
         Args:
             evaluator: the runs.
@@ -305,20 +319,16 @@ class _CubatureFilters:
         simulator = evaluator.simulator
         assert isinstance(simulator, RobotSimulator)
         joints = len(simulator.addresses.positions)
+        # The state consists of positions and velocities.
         self._joints, self._size = joints, 2 * joints
         self._point_count = count_cubature_points(joints)
         acting = simulator.get_active_effects(np.array([h.theta for h in hypotheses]))
         typical = compute_joint_scales(simulator.robot).force
         self._force_deviations = np.array([h.share * typical for h in hypotheses])
-        starts, speed_priors, controls, forces = [], [], [], []
+        starts, priors, controls, forces = [], [], [], []
         for index, hypothesis in enumerate(hypotheses):
             run_data = evaluator.prepared_runs[hypothesis.run]
-            start = evaluator.initial_state_guesses[hypothesis.run].copy()
-            speed_prior = np.ones(joints)
-            measured = estimate_measured_states(evaluator, sigma, hypothesis.run)
-            for joint, states in measured.items():
-                start[joints + joint] = states[0, 1]
-                speed_prior[joint] = _compute_speed_deviation(evaluator, sigma, joint)
+            start, prior = _guess_first_state(evaluator, sigma, hypothesis.run)
             own_effects = slice_active_effects(acting, np.array([index]))
             work = RobotRunBatch(
                 run_data.scenario,
@@ -327,22 +337,24 @@ class _CubatureFilters:
                 start[None, :joints],
                 start[None, joints:],
             )
+            # A batch of one run, hence the index 0.
             inputs = simulator.compute_controls(work, simulator.count_steps(work.times) + 1)
             controls.append(inputs.controls[0])
             forces.append(inputs.forces[0])
             starts.append(start)
-            speed_priors.append(speed_prior)
+            priors.append(prior)
         self._controls, self._forces = np.array(controls), np.array(forces)
-        self._start = np.array(starts)
-        self._prior = np.hstack([np.full((len(starts), joints), POSITION_PRIOR), speed_priors])
+        self._start, self._prior = np.array(starts), np.array(priors)
         # Sample times and added elements of all hypotheses are equal, so those of the last one
         # serve.
         self._knots = np.rint(work.times / simulator.time_step).astype(np.intp)
         self._mujoco_batch = simulator.make_linearisation_batch(own_effects)
-        # One hypothesis may need several batches, whose elements all have its effects.
+        # Index of the hypothesis of each element of the engine's batch. One hypothesis may need
+        # several batches, whose elements all have its effects.
         elements = np.repeat(np.arange(len(hypotheses)), self._point_count)[
             : self._mujoco_batch.count
         ]
+        # Effects that change numbers of the model, such as a friction.
         written = slice_active_effects(select_model_field_effects(acting), elements)
         self._acting = pad_coefficients(written, elements.size, self._mujoco_batch.count)
         names = [*simulator.system.coordinates, *simulator.system.rates]
@@ -356,68 +368,78 @@ class _CubatureFilters:
     def smooth(self) -> list[SmoothedStart]:
         """Filter the runs forward, smooth them backward, and return the first states.
 
-        Each interval is propagated by the cubature points, eq. (1) of the module docstring, and its
-        moments are kept. Backward, the smoother of Rauch, Tung and Striebel, eq. (2), uses them. A
-        filter that diverges has the log-likelihood -inf.
+        1. Forward: update the states by the readings of each sample, and predict those of the next
+           sample by cubature points. The moments of each interval are kept.
+        2. Backward: correct the states by what later readings say (smoother of Rauch, Tung and
+           Striebel).
+
+        Returns:
+            The result of each hypothesis; the log-likelihood of a filter that diverges is -inf.
         """
-        # Components of the state, and of the state augmented by a force at each joint.
-        size, component_count = self._size, self._point_count // 2
         mean = self._start.copy()
-        covariance = np.square(self._prior)[:, :, None] * np.eye(size)
-        points = np.sqrt(component_count) * np.concatenate(
-            [np.eye(component_count), -np.eye(component_count)]
-        )
+        covariance = np.square(self._prior)[:, :, None] * np.eye(self._size)
         log_likelihood = np.zeros(len(mean))
         has_failed = np.zeros(len(mean), dtype=bool)
-        intervals: list[tuple[Array, ...]] = []
-        added_covariance = ADDED_VARIANCE * np.eye(size)
-        # Forward: update by the readings of a sample, then propagate to the next one.
+        intervals: list[_IntervalMoments] = []
+        last_sample = self._knots.size - 1
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             self._mujoco_batch.write_effects(self._acting)
-            for i, (begin, end) in enumerate(zip(self._knots, self._knots[1:], strict=False)):
+            # 1. Forward.
+            for i in range(self._knots.size):
                 log_likelihood_gain, mean, covariance = self._update(i, mean, covariance)
                 log_likelihood += log_likelihood_gain
-                root = compute_root(covariance + added_covariance)
-                displacements = points[:, :size] @ root.swapaxes(1, 2)  # (1)
-                missing_forces = points[:, size:] * self._force_deviations[:, None]
-                ends = self._propagate(
-                    mean[:, None] + displacements, missing_forces, int(begin), int(end)
-                )
-                has_failed |= ~np.isfinite(ends).all(axis=(1, 2))
-                ends[has_failed] = 0.0
-                # Moments of the propagated points.
-                predicted = ends.mean(axis=1)
-                deviations = ends - predicted[:, None]
-                predicted_covariance = deviations.swapaxes(1, 2) @ deviations / ends.shape[1]
-                predicted_covariance += added_covariance
-                cross_covariance = displacements.swapaxes(1, 2) @ deviations / ends.shape[1]
-                intervals.append(
-                    (mean, covariance, predicted, predicted_covariance, cross_covariance)
-                )
-                mean, covariance = predicted, predicted_covariance
-            log_likelihood_gain, mean, covariance = self._update(
-                self._knots.size - 1, mean, covariance
-            )
-            log_likelihood += log_likelihood_gain
-            # Backward: correct each filtered state by what later readings say.
-            for (
-                filtered_mean,
-                filtered_covariance,
-                predicted,
-                predicted_covariance,
-                cross_covariance,
-            ) in reversed(intervals):
-                gain = _solve(predicted_covariance, cross_covariance.swapaxes(1, 2))  # (2)
-                gain = gain.swapaxes(1, 2)
-                mean = filtered_mean + (gain @ (mean - predicted)[..., None])[..., 0]
-                covariance = filtered_covariance + gain @ (
-                    covariance - predicted_covariance
-                ) @ gain.swapaxes(1, 2)
+                if i < last_sample:
+                    interval = self._predict(i, mean, covariance, has_failed)
+                    intervals.append(interval)
+                    mean, covariance = interval.predicted, interval.predicted_covariance
+            # 2. Backward.
+            for interval in reversed(intervals):
+                mean, covariance = _smooth_interval(interval, mean, covariance)
         log_likelihood[has_failed | ~np.isfinite(log_likelihood)] = -np.inf
         return [
             SmoothedStart(*smoothed)
             for smoothed in zip(log_likelihood.tolist(), mean, covariance, strict=True)
         ]
+
+    def _predict(
+        self, i: int, mean: Array, covariance: Array, has_failed: Mask
+    ) -> _IntervalMoments:
+        """Predict the states of F hypotheses at the next sample, by cubature points.
+
+        The state is augmented by a random missing force at each joint, which is constant until the
+        next sample. The 2 n points of the n components, m +- sqrt(n) S e_j of eq. (1) with the mean
+        m and a root S of the covariance, are stepped through the engine.
+
+        Args:
+            i: index of the sample from which the states are propagated.
+            mean: (F, Z) filtered states at this sample.
+            covariance: (F, Z, Z) their covariances.
+            has_failed: (F,) mask of the filters that have diverged so far; it is updated in place.
+
+        Returns:
+            Means and covariances of the states at both samples.
+        """
+        size, component_count = self._size, self._point_count // 2
+        added_covariance = ADDED_VARIANCE * np.eye(size)
+        # Points (2 n, n) in units of the standard deviations, of which the last D are forces.
+        points = np.sqrt(component_count) * np.concatenate(
+            [np.eye(component_count), -np.eye(component_count)]
+        )
+        root = compute_root(covariance + added_covariance)
+        displacements = points[:, :size] @ root.swapaxes(1, 2)  # (1)
+        missing_forces = points[:, size:] * self._force_deviations[:, None]
+        begin, end = self._knots[i : i + 2].tolist()
+        ends = self._propagate(mean[:, None] + displacements, missing_forces, begin, end)
+        has_failed |= ~np.isfinite(ends).all(axis=(1, 2))
+        # A diverged filter must not spread numbers that are not finite; its result is discarded.
+        ends[has_failed] = 0.0
+        # Moments of the propagated points.
+        predicted = ends.mean(axis=1)
+        deviations = ends - predicted[:, None]
+        predicted_covariance = deviations.swapaxes(1, 2) @ deviations / ends.shape[1]
+        predicted_covariance += added_covariance
+        cross_covariance = displacements.swapaxes(1, 2) @ deviations / ends.shape[1]
+        return _IntervalMoments(mean, covariance, predicted, predicted_covariance, cross_covariance)
 
     def _update(self, i: int, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
         """Update means and covariances of F hypotheses by the readings of sample i (Kalman filter).
@@ -434,10 +456,13 @@ class _CubatureFilters:
         """
         readings, rows = self._observed[:, i], self._rows
         is_recorded = np.isfinite(readings)
-        # A missing reading has the observation matrix 0, the residual 0 and the variance 1.
+        # A missing reading has the observation matrix 0, the residual 0 and the variance 1, so that
+        # it changes neither state nor likelihood.
         residual = np.where(is_recorded, readings - mean[:, rows], 0.0)
+        # Covariance H P of the readings with the state, with the observation matrix H.
         observed_covariance = is_recorded[:, :, None] * covariance[:, rows]
         variances = np.where(is_recorded, self._variances, 1.0)
+        # H P H' + R
         innovation_covariance = observed_covariance[:, :, rows] * is_recorded[
             :, None, :
         ] + variances[:, :, None] * np.eye(len(rows))
@@ -448,6 +473,7 @@ class _CubatureFilters:
         log_likelihood = -0.5 * ((residual * weighted).sum(axis=1) + log_determinant)
         new_covariance = covariance - gain @ observed_covariance
         new_mean = mean + (gain @ residual[..., None])[..., 0]
+        # Rounding makes the two halves of a covariance differ.
         return log_likelihood, new_mean, 0.5 * (new_covariance + new_covariance.swapaxes(1, 2))
 
     def _propagate(self, states: Array, forces: Array, begin: int, end: int) -> Array:
@@ -471,8 +497,9 @@ class _CubatureFilters:
         joints, mujoco_batch = self._joints, self._mujoco_batch
         position_columns = mujoco_batch.file_joints.positions
         velocity_columns = mujoco_batch.file_joints.velocities
+        # The index of the hypothesis of each state selects its controls and recorded forces.
         flat_states, flat_forces = states.reshape(-1, 2 * joints), forces.reshape(-1, joints)
-        runs = np.repeat(np.arange(len(states)), states.shape[1])
+        hypotheses = np.repeat(np.arange(len(states)), states.shape[1])
         result = np.empty_like(flat_states)
         for first in range(0, len(flat_states), mujoco_batch.count):
             part = slice(first, first + mujoco_batch.count)
@@ -483,20 +510,94 @@ class _CubatureFilters:
             mujoco_batch.set_initial_state(
                 part_states[:, :joints], part_states[:, joints:], no_pose
             )
-            applied_forces = self._forces[runs[part], begin:end]
+            # An index array makes a copy, so that the recorded forces stay as they are.
+            applied_forces = self._forces[hypotheses[part], begin:end]
             applied_forces[:, :, velocity_columns] += flat_forces[part, None]
             motion = mujoco_batch.step(
-                self._controls[runs[part], begin:end], applied_forces, ["qpos", "qvel"]
+                self._controls[hypotheses[part], begin:end], applied_forces, ["qpos", "qvel"]
             )
+            # The states after the last step.
             result[part, :joints] = motion["qpos"][:, -1, position_columns]
             result[part, joints:] = motion["qvel"][:, -1, velocity_columns]
             result[part][mujoco_batch.failed[:count]] = np.nan
         return result.reshape(states.shape)
 
 
+class _IntervalMoments(NamedTuple):
+    """Moments of the states of F hypotheses at both ends of an interval between two samples.
+
+    Attributes:
+        mean: (F, Z) filtered states at its beginning, given the readings up to there.
+        covariance: (F, Z, Z) their covariances.
+        predicted: (F, Z) predicted states at its end.
+        predicted_covariance: (F, Z, Z) their covariances.
+        cross_covariance: (F, Z, Z) covariances of the states at the beginning (rows) with those at
+            the end.
+    """
+
+    mean: Array
+    covariance: Array
+    predicted: Array
+    predicted_covariance: Array
+    cross_covariance: Array
+
+
+def _smooth_interval(
+    interval: _IntervalMoments, mean: Array, covariance: Array
+) -> tuple[Array, Array]:
+    """Smooth the states at the beginning of an interval, given those at its end.
+
+    The smoothed mean is m + D (m_end - m-) with the gain D = C inv(P-), the filtered mean m, the
+    prediction m- with the covariance P-, and the cross-covariance C of both ends (Rauch, Tung and
+    Striebel, eq. (2) of the module docstring).
+
+    Args:
+        interval: moments of the filter in the interval.
+        mean: (F, Z) smoothed states at its end, m_end.
+        covariance: (F, Z, Z) their covariances.
+
+    Returns:
+        Smoothed states (F, Z) at the beginning, and their covariances.
+    """
+    # D' solves P- D' = C'.
+    transposed_gain = _solve(
+        interval.predicted_covariance, interval.cross_covariance.swapaxes(1, 2)
+    )  # (2)
+    gain = transposed_gain.swapaxes(1, 2)
+    new_mean = interval.mean + (gain @ (mean - interval.predicted)[..., None])[..., 0]
+    new_covariance = interval.covariance + gain @ (
+        covariance - interval.predicted_covariance
+    ) @ gain.swapaxes(1, 2)
+    return new_mean, new_covariance
+
+
 def count_cubature_points(joints: int) -> int:
     """Return the number of points: two each for the position, velocity and force of a joint."""
     return 2 * 3 * joints
+
+
+def _guess_first_state(evaluator: RunEvaluator, sigma: Array, run: int) -> tuple[Array, Array]:
+    """Return a guess of the first state of a run, and its prior standard deviations.
+
+    Positions are those of the evaluator; velocities are estimated from the readings where a joint
+    is recorded.
+
+    Args:
+        evaluator: the runs.
+        sigma: (C,) standard deviation of the noise of each channel.
+        run: index of the run.
+
+    Returns:
+        Positions and velocities (2 D,) of D joints, and their standard deviations (2 D,).
+    """
+    start = evaluator.initial_state_guesses[run].copy()
+    joints = start.size // 2
+    prior = np.concatenate([np.full(joints, POSITION_PRIOR), np.ones(joints)])
+    for joint, states in estimate_measured_states(evaluator, sigma, run).items():
+        # Velocity (index 1) at the first sample.
+        start[joints + joint] = states[0, 1]
+        prior[joints + joint] = _compute_speed_deviation(evaluator, sigma, joint)
+    return start, prior
 
 
 def _compute_speed_deviation(evaluator: RunEvaluator, sigma: Array, joint: int) -> float:

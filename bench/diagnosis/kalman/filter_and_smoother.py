@@ -109,7 +109,8 @@ class LinearRuns:
         """Split the runs into segments of `length` samples, each with the prior of a run.
 
         The process noise is fitted on such segments: they are filtered in parallel, so this needs
-        fewer steps.
+        fewer steps. The last segment of a run is padded with zeros, which count as missing readings
+        and do not change the likelihood.
         """
         run_count, samples, _ = self.residuals.shape
         # Number of segments of a run, rounded up.
@@ -127,6 +128,7 @@ class LinearRuns:
 
     def _map_arrays(self, change: Callable[[Any], Any]) -> LinearRuns:
         """Return the runs with a function applied to the arrays of all runs."""
+        # The prior is that of each run, and has no axis for the runs.
         names = [one.name for one in fields(self) if one.name != "prior"]
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
         return replace(self, **changed)
@@ -147,6 +149,7 @@ class LinearRuns:
         stacked: dict[str, Array] = {}
         for name in STACKED:
             parts = [getattr(run_maps, name) for run_maps in maps]
+            # Readings belong to samples, all other arrays to the intervals between samples.
             length = samples if name == "readings" else samples - 1
             values = np.zeros((runs, length, *parts[0].shape[1:]))
             # After the end of a run, the state stays as it is.
@@ -157,6 +160,7 @@ class LinearRuns:
             # A step in which the model diverges gives no information on the next one.
             values[~(np.abs(values) < MAX_MAGNITUDE)] = 0.0
             stacked[name] = values
+        # Recorded minus predicted readings at the motion about which the models are linear.
         residuals = np.zeros(observed.shape)
         for run, run_maps in enumerate(maps):
             count = len(run_maps.predicted)
@@ -227,13 +231,14 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
     white noise w of variance one. It is added to the reading of the channel. A small share of white
     noise remains, so that the filter stays well conditioned.
 
+    Shapes: R runs, T samples, Z states, E missing forces, C channels, N channels with φ > 0.
+
     Args:
-        runs: the linear models.
-        noise: standard deviation and correlation of each channel.
+        runs: the linear models, with the arrays A, d, G and H of `LinearRuns`.
+        noise: standard deviation σ and correlation φ of each channel.
 
     Returns:
-        The models with one more state for each channel with correlated noise, and R (C,), the
-        variances of the remaining white noise.
+        The models with N more states, and the variances (C,) of the remaining white noise.
     """
     coloured_channels = np.flatnonzero(noise.phi > 0)
     white_variances = np.square(noise.sigma)
@@ -243,6 +248,7 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
     white_variances[coloured_channels] *= AR_FLOOR
     (run_count, samples, channels), size = runs.residuals.shape, runs.prior.size
     force_count, noise_count = runs.forces.shape[3], coloured_channels.size
+    # The noise states follow the Z states, and their innovations the E forces.
     transitions = np.zeros((run_count, samples - 1, size + noise_count, size + noise_count))
     transitions[:, :, :size, :size] = runs.states
     noise_states = size + np.arange(noise_count)
@@ -279,30 +285,36 @@ def add_noise_states(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, A
 def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     """Follow all runs with a Kalman filter, eqs. (1) to (4) of the module docstring.
 
+    The filter estimates the deviation of the state from the motion about which the model is linear.
     A recording has no reading of some channels at some samples. Such a reading is replaced by zero
     with variance one and no dependence on the state, so that it changes neither state nor
     likelihood.
 
     Args:
         runs: the linear models of B runs.
-        force: (E,) standard deviations of the missing forces, or (B, E) of each run. Further
-            columns of the matrix G, which are those of coloured noise, have 1.
-        white: R (C,) variances of white noise.
+        force: (E,) standard deviations of the missing forces (process noise), or (B, E) of each
+            run. Further columns of the matrix G, which are those of coloured noise, have 1.
+        white: (C,) variances of the white noise of C channels.
 
     Returns:
         Results of the filter; the log-likelihood of a run in which the model diverges is -inf.
+
+    Raises:
+        ValueError: the models do not have one interval fewer than samples.
     """
     if runs.states.shape[1] != runs.residuals.shape[1] - 1:
         raise ValueError(f"expected a step between two samples, got {runs.states.shape[1]} steps")
     # The residuals and rows of H of missing readings are zero already.
     variances = np.where(runs.recorded, white, 1.0)
+    # The arguments of the compiled function are in the order of its signature. Its last results are
+    # buffers.
     predicted, covariances, innovations, gains, whiteners, likelihood, *_ = COMPILED.call(
         run_filter,
         *_make_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
         *(np.square(runs.jumps), variances, runs.prior),
         *(_complete_deviations(force, runs), np.array([LARGEST_COVARIANCE])),
     )
-    # The likelihood of a model that diverges is set to zero.
+    # The likelihood of a model that diverges is zero; `>` is also false for NaN.
     likelihood = np.where(likelihood > -LARGEST_LOSS, likelihood, -np.inf)
     return Filtered(predicted, covariances, innovations, gains, whiteners, likelihood)
 
@@ -312,11 +324,11 @@ def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
 
     The smoothed states and forces are the most likely ones, given all samples of a run and not only
     those before. The score of a force, eq. (7), is the ratio of its measured to its expected mean
-    square: above one if its assumed variance is too small.
+    square: above one if its assumed variance is too small. It is one where the model diverges.
 
     Args:
         runs: the linear models.
-        filtered: results of the filter for these runs.
+        filtered: results of the filter for these runs, with covariances.
         force: standard deviations of the missing forces, as for `filter_runs`.
     """
     states, forces, measured, expected, *_ = COMPILED.call(
@@ -344,12 +356,12 @@ def fit_process_noise(
     Args:
         runs: the linear models.
         force: (E,) initial standard deviations.
-        white: R (C,) variances of white noise.
+        white: (C,) variances of the white noise of C channels.
         typical: (E,) typical forces in N or N·m; a small share of them is the minimum.
 
     Returns:
-        The standard deviations (E,), and the results of filter and smoother with them, without the
-        covariances of the states.
+        The standard deviations (E,), and the results of filter and smoother of the whole runs,
+        without the covariances of the states.
     """
     count = force.size
     # Short segments in parallel need fewer steps, and show the same process noise.
@@ -362,7 +374,8 @@ def fit_process_noise(
         last, log_likelihood = log_likelihood, float(filtered.log_likelihood.sum())
         if abs(log_likelihood - last) < MIN_ITERATION_GAIN:
             break
-        # Scores after the first `count` are those of coloured noise, whose variance is known.
+        # Scores after the first `count` are those of coloured noise, whose variance is known. A
+        # score is a ratio of variances, and its root that of standard deviations.
         ratio = np.clip(np.sqrt(smoothed.score[:count]), 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
         new_force = np.maximum(force * ratio, SMALLEST_FORCE * typical)
         has_converged = bool((np.abs(new_force / force - 1.0) < CONVERGENCE_TOLERANCE).all())

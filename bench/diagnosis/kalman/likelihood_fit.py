@@ -64,12 +64,13 @@ def maximise_innovation_likelihood(
 ) -> FollowedRuns:
     """Maximise the likelihood of the innovations by Gauss-Newton steps with step halving.
 
-    A step that does not increase the likelihood is halved a few times. The fit ends when a step is
-    predicted to gain, or gains, less than `min_gain`.
+    Innovations are the differences between the readings and their predictions by the Kalman filter
+    of the runs. A step that does not increase their likelihood is halved a few times. The fit ends
+    when a step is predicted to gain, or gains, less than `min_gain`.
 
     Args:
         followed: the runs, filtered with the initial parameters.
-        bounds: bounds of the fitted parameters, by index.
+        bounds: lower and upper bounds of the fitted parameters, by index in theta.
         iterations: maximum number of steps.
         follow: filters the runs with other parameters (its first argument); its second argument is
             the best filter so far, whose motion may be reused.
@@ -86,6 +87,7 @@ def maximise_innovation_likelihood(
         step, predicted_gain = compute_likelihood_step(best, bounds)
         if predicted_gain < min_gain:
             break
+        # The whole step first, then the halved ones.
         gain = 0.0
         for _ in range(1 + MAX_HALVINGS):
             followed.evaluator.search_control.check_not_stopped()
@@ -111,23 +113,26 @@ def compute_likelihood_step(
 
     Args:
         followed: the runs, filtered with the present parameters.
-        bounds: bounds of the parameters that change, by index; they limit the step. It may be
-            empty: a set of effects without any has no such parameters.
+        bounds: lower and upper bounds of the n parameters that change, by index in theta; they
+            limit the step. There may be none.
 
     Returns:
         The change of all parameters (P,), zero for those without bounds, and the gain in
-        log-likelihood, J'e x - x J'J x / 2, that is predicted for linear innovations.
+        log-likelihood, e'J x - x'J'J x / 2, that is predicted for linear innovations.
     """
     indices = list(bounds)
     if not indices:
         return np.zeros_like(followed.theta), 0.0
+    # J, J'J and J'e; rows of J are all samples of all channels and runs.
     derivatives = _compute_derivatives(followed, bounds)
     information = derivatives.T @ derivatives
     cross = derivatives.T @ followed.filtered.whitened.reshape(-1)
+    # Lengths of the columns of J.
     scale = np.maximum(np.sqrt(np.diagonal(information)), 1e-300)
     normal = information / scale / scale[:, None] + RIDGE * np.eye(len(indices))
     values = followed.theta[indices]
     low, high = np.array(list(bounds.values())).T
+    # The change x, after which the parameters are within their bounds.
     change = np.clip(values + np.linalg.solve(normal, cross / scale) / scale, low, high) - values
     step = np.zeros_like(followed.theta)
     step[indices] = change
@@ -136,6 +141,9 @@ def compute_likelihood_step(
 
 def compute_information(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Information:
     """Return the Fisher information of some parameters in the innovations.
+
+    It is J'J with the derivatives J of the whitened innovations by the parameters. Its inverse is
+    their covariance.
 
     Args:
         followed: the runs, filtered with the present parameters.
@@ -155,16 +163,20 @@ def compute_wald_statistics(
     without the effect is needed. Pseudo-inverses allow parameters that the data do not determine.
 
     Args:
-        evaluator: the runs.
-        theta: (P,) parameters of the set.
-        names: its effects.
+        evaluator: the runs, with the indices of the coefficients in theta.
+        theta: (P,) parameters of the model with the effects.
+        names: names of the effects.
         information: Fisher information of all fitted parameters, also those of no effect.
+
+    Returns:
+        The loss for each effect, by name.
     """
     covariance = np.linalg.pinv(information.matrix, hermitian=True)
     statistics = {}
     for name in names:
         indices = evaluator.get_coefficient_indices(name)
         rows = [information.indices.index(i) for i in indices]
+        # V^-1
         inverse = np.linalg.pinv(covariance[np.ix_(rows, rows)], hermitian=True)
         coefficients = theta[indices]
         statistics[name] = float(coefficients @ inverse @ coefficients)
@@ -174,8 +186,9 @@ def compute_wald_statistics(
 def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -> Array:
     """Return minus the derivatives (R T C, n) of the whitened innovations by n parameters.
 
-    They are one-sided differences that stay within the bounds. The derivative by a parameter whose
-    bounds are equal is zero. Rows are the T samples of C channels of R runs.
+    The sign makes them the derivatives of what the model predicts. They are one-sided differences
+    that stay within the bounds. The derivative by a parameter whose bounds are equal is zero. Rows
+    are the T samples of C channels of R runs.
 
     Args:
         followed: the runs, followed with the present parameters.
@@ -184,6 +197,7 @@ def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -
     differences = np.array(
         [_compute_difference(followed, index, limits) for index, limits in bounds.items()]
     )
+    # Parameters whose bounds differ.
     columns = np.flatnonzero(differences)
     parameters = np.array(list(bounds), dtype=np.intp)[columns]
     responses = compute_parameter_responses(followed, parameters.tolist(), differences[columns])
@@ -210,5 +224,5 @@ def _compute_difference(followed: FollowedRuns, index: int, bounds: Bounds) -> f
     value = float(followed.theta[index])
     # More dry friction than in the model file (a positive value) acts otherwise than less of it, so
     # the difference does not cross zero.
-    is_up = value + size <= high and (value >= 0.0 or value - size < low)
-    return size if is_up else -size
+    is_upward = value + size <= high and (value >= 0.0 or value - size < low)
+    return size if is_upward else -size

@@ -89,10 +89,11 @@ class FollowedRuns:
         noise: sensor noise.
         linear: linearised model of each run.
         runs: the linear models, stacked, without states for coloured noise.
-        force: (E,) standard deviations of the missing forces.
+        force: (E,) standard deviations of the missing forces (process noise), one at each joint,
+            then one for each degree of freedom of floating bodies.
         filtered: results of the filter.
         smoothed: results of the smoother.
-        typical: (E,) typical forces.
+        typical: (E,) typical forces, in N or N·m.
     """
 
     evaluator: RunEvaluator
@@ -118,9 +119,10 @@ class FollowedRuns:
         """Linearise a model about the measured motion and filter the runs.
 
         The filter's smoothed motion is closer to the true one, so the model is linearised and
-        filtered again about it, while the log-likelihood increases. For a robot on the ground, each
-        motion is simulated from the smoothed first state instead, because measured contacts are too
-        deep.
+        filtered again about it, while the log-likelihood increases. For a robot on the ground (one
+        that stands or drives), each motion is simulated from the smoothed first state instead,
+        because measured contacts are too deep. Missing forces are random forces that the filter
+        allows for (process noise), because the model may be incomplete.
 
         Args:
             evaluator: the runs.
@@ -133,7 +135,8 @@ class FollowedRuns:
             max_linearisations: maximum number of linearisations if the motion is not given.
 
         Returns:
-            The filter with the highest log-likelihood.
+            The filter with the highest log-likelihood. The first one, about the motion of the
+            readings, counts only if it is the only one, or if motions are simulated.
         """
         assert isinstance(evaluator.simulator, RobotSimulator)
         robot = evaluator.simulator.robot
@@ -141,49 +144,68 @@ class FollowedRuns:
             [compute_joint_scales(robot).force, compute_floating_forces(robot)]
         )
         best: FollowedRuns | None = None
+        # None: to be estimated from the readings.
         unknown = [None] * len(evaluator.prepared_runs)
         motions: Sequence[Trajectory | None] = trajectories or unknown
         first_states: Sequence[FirstState | None] = unknown
         # Near the data, Jacobians change little from one motion to another, so they are reused.
         neighbours: Sequence[MeasuredLinear | None] = unknown
         for iteration in range(max_linearisations if trajectories is None else 1):
-            neighbours = linear = [
+            linear = [
                 linearise_run(
-                    *(evaluator, theta, noise, run, motion, neighbour), first_state=first_state
+                    evaluator,
+                    theta,
+                    noise,
+                    run,
+                    trajectory=motion,
+                    neighbour=neighbour,
+                    first_state=first_state,
                 )
                 for run, (motion, neighbour, first_state) in enumerate(
                     zip(motions, neighbours, first_states, strict=True)
                 )
             ]
+            neighbours = linear
             initial_force = FIRST_FORCE * typical if force is None else force
             followed = cls._filter_linear(evaluator, theta, noise, linear, initial_force, typical)
+            # The next fit of the noise starts from this one.
             force, noise = followed.force, followed.noise
             gain = np.inf if best is None else followed.log_likelihood - best.log_likelihood
-            # The first motion is that of the readings alone, which no robot can move. So the second
-            # filter replaces the first one in any case, unless motions are simulated.
+            # The first motion is that of the readings alone, which the robot may not be able to
+            # make. So the second filter replaces the first one in any case, unless motions are
+            # simulated.
             is_second_about_possible_motion = iteration == 1 and not robot.is_on_ground
             best = followed if gain > 0.0 or is_second_about_possible_motion else best
+            # For the next iteration.
             motions, first_states = followed._get_smoothed_motions()
             if not gain > LINEARISED_GAIN:
                 break
+        # There was at least one iteration.
         assert best is not None
         return best
 
     def recompute_jacobians(self) -> FollowedRuns:
         """Return the filter with Jacobians about its own smoothed motion, if that is likelier.
 
-        `follow` takes the Jacobians from the motion of the readings, which saves most of its time.
-        There, the noise reverses the friction of joints that rest or creep, so that the filter of
-        an arm with dry friction may need large missing forces. This is tried only if it has such.
+        `follow` takes the Jacobians (derivatives of the simulator's steps) from the motion of the
+        readings, which saves most of its time. There, the noise reverses the friction of joints
+        that rest or creep, so that the filter of an arm with dry friction may need large missing
+        forces (process noise). So this is tried only while a missing force is not negligible.
+
+        Returns:
+            The likeliest filter; this one if none is clearly likelier.
         """
         best, negligible_force = self, FIRST_FORCE * self.typical
+        # Its motions are simulated, and their Jacobians are not reused.
         if self.is_on_ground:
             return self
         for _ in range(MAX_LINEARISATIONS):
             if not (best.force > negligible_force).any():
                 break
             linear = [
-                linearise_run(self.evaluator, self.theta, self.noise, run, motion, None)
+                linearise_run(
+                    self.evaluator, self.theta, self.noise, run, trajectory=motion, neighbour=None
+                )
                 for run, motion in enumerate(best.trajectories)
             ]
             followed = self._filter_linear(
@@ -213,13 +235,20 @@ class FollowedRuns:
             similar: filter of a similar model, whose Jacobians are reused; None to compute them,
                 unless those of this filter are certain to be equal (`_has_jacobians_of`).
         """
+        # Another simulator may have other derivatives at equal parameters.
         reuses_jacobians = similar is not None or (
             simulator is None and self._has_jacobians_of(theta)
         )
         motions, first_states = self._get_smoothed_motions()
         linear = [
             linearise_run(
-                *(self.evaluator, theta, self.noise, run, motion, neighbour, simulator),
+                self.evaluator,
+                theta,
+                self.noise,
+                run,
+                trajectory=motion,
+                neighbour=neighbour,
+                simulator=simulator,
                 reuses_jacobians=reuses_jacobians,
                 first_state=first_state,
             )
@@ -238,6 +267,9 @@ class FollowedRuns:
 
         For a robot on the ground, only first states are given, from which motions are simulated;
         they are weighted by inverse covariances. For all others, the smoothed motions are given.
+
+        Returns:
+            Motion of each run and first state of each run; one of the two lists contains only None.
         """
         unknown = [None] * len(self.linear)
         if self.is_on_ground:
@@ -261,6 +293,7 @@ class FollowedRuns:
             theta: (P,) parameters of the model.
         """
         evaluator = self.evaluator
+        # Indices of the parameters that differ and may change the Jacobians.
         changed = set(np.flatnonzero(theta != self.theta).tolist())
         for name in evaluator.coefficient_slices:
             members = members_of(evaluator.available_effects[name])
@@ -293,9 +326,10 @@ class FollowedRuns:
         with np.errstate(all="ignore"):
             maps = [run_model.interval_maps() for run_model in linear]
             # The state has internal states of effects after positions and velocities.
-            prior = _compute_prior_deviations(evaluator, linear, maps[0].states.shape[1])
+            prior = _compute_prior_deviations(evaluator, linear, size=maps[0].states.shape[1])
             runs = LinearRuns.stacked(maps, evaluator.observed, prior)
             fitted = _fit_noise(runs, noise, force, typical)
+        # `fitted` has the noise, the missing forces, and the results of filter and smoother.
         return cls(evaluator, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
 
     @classmethod
@@ -313,6 +347,7 @@ class FollowedRuns:
             theta: (P,) parameters of the model.
             noise: sensor noise.
         """
+        # The filter stored last.
         known: FollowedRuns | None = evaluator.filtered_runs
         if (
             known is not None
@@ -349,13 +384,15 @@ class FollowedRuns:
         """Loss in twice the log-likelihood (E,) if the process noise of one force is removed.
 
         Process noise stands for unknown forces. A large loss shows that the model lacks a force at
-        this coordinate. Noise is not removed wholly, but reduced to a negligible force.
+        this coordinate (a joint, or a degree of freedom of a floating body). Noise is not removed
+        wholly, but reduced to a negligible force, so that the filter stays well conditioned.
         """
         coloured, white = add_noise_states(self.runs, self.noise)
         log_likelihood = self.log_likelihood
         losses = []
         for coordinate in range(self.force.size):
             force = self.force.copy()
+            # A share of the typical force at this coordinate.
             force[coordinate] = SMALLEST_FORCE * self.typical[coordinate]
             filtered = filter_runs(coloured, force, white)
             losses.append(2.0 * (log_likelihood - float(filtered.log_likelihood.sum())))
@@ -394,6 +431,7 @@ class FollowedRuns:
             count = linear.knots.size
             states = self.smoothed.states[run, :count, :size]
             forces = self.smoothed.forces[run, : count - 1, : self.force.size]
+            # The motion about which the model is linear, plus the deviations at all steps.
             trajectories.append(linear.moved(linear.propagate_deviations(states, forces)))
         return trajectories
 
@@ -416,9 +454,11 @@ class FollowedRuns:
         """
         joints = len(self.linear[0].trajectory.x[0])
         # The state of the linear model may have joints in series after those of the robot.
+        # Indices of the positions and the velocities; `positions` is the number of positions.
         joint_states = np.concatenate(
             [np.arange(joints), self.linear[0].positions + np.arange(joints)]
         )
+        # Unit change of one first state in each column.
         initial_changes = np.zeros((len(self.linear), self.runs.prior.size, joint_states.size))
         initial_changes[:, joint_states, np.arange(joint_states.size)] = 1.0
         result = np.zeros((*self.runs.residuals.shape, len(self.evaluator.state_names)))
@@ -437,6 +477,7 @@ class FollowedRuns:
             seconds: duration of the segments; whole runs by default.
         """
         samples = self.runs.residuals.shape[1]
+        # Number of samples of a segment, at least two.
         length = int(min(max(seconds / self.evaluator.sample_interval, 1.0) + 1, samples))
         segments = self if length == samples else replace(self, runs=self.runs.segments(length))
         channels = list(self.evaluator.channels)
@@ -447,6 +488,7 @@ class FollowedRuns:
         # One column for the error of each recorded position.
         errors = np.zeros((len(segments.runs.residuals), self.runs.prior.size, len(recorded)))
         errors[:, recorded, np.arange(len(recorded))] = sigma
+        # Changes of the readings (R, T, C, K) in units of the noise of their channel.
         changes = segments.propagate_without_gain(errors) / self.noise.sigma[:, None]
         return float(np.abs(changes).max(initial=0.0))
 
@@ -456,8 +498,9 @@ class FollowedRuns:
         """Propagate K changes of the first states, and optional inputs, through the linear model.
 
         So would simulated runs change, which no reading corrects. The recursion is s[i+1] = A s[i]
-        + B f[i] with readings H s[i] + ψ[i]: that of the filter with gain zero. Changes of readings
-        that diverge are set to zero.
+        + B f[i] with readings H s[i] + ψ[i]: that of the filter with gain zero. A is the transition
+        matrix, B the response to the inputs, and H the observation matrix of the linear model.
+        Changes of readings that diverge are set to zero.
 
         Args:
             s: (R, Z, K) changes of the Z components of the first states of R runs.
@@ -509,11 +552,13 @@ class FollowedRuns:
         largest velocity of the joint, and not the share `VELOCITY_PRIOR` of it.
         """
         joints = len(self.linear[0].trajectory.x[0])
+        # Further states are fitted, whose prior is not known.
         if len(self.evaluator.state_names) != 2 * joints:
             return None
         if self.is_on_ground:
             return compute_measured_state_prior(self.evaluator, self.noise)
         prior = self.runs.prior
+        # Velocities follow all positions, which may include those of joints in series.
         velocities = prior[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
         return np.concatenate([prior[:joints], velocities])
 
@@ -539,11 +584,13 @@ class FollowedRuns:
         first_states = []
         coordinates = self.evaluator.simulator.system.coordinates
         for run, trajectory in enumerate(self.trajectories):
+            # Step at the first sample.
             first_step = int(self.linear[run].knots[0])
             x, v = trajectory.x[first_step].copy(), trajectory.v[first_step].copy()
             for joint, states in estimate_measured_states(
                 self.evaluator, self.noise.sigma, run
             ).items():
+                # Position, velocity and acceleration at the first sample.
                 x[joint], v[joint], _ = states[0]
                 channel = self.evaluator.channels.index(coordinates[joint])
                 resting = estimate_resting_position(
@@ -570,10 +617,12 @@ class FollowedRuns:
         change are simulated, and each run gets the one that is closest to its readings.
         """
         fitter, changes = self.first_state_fitter, []
+        # Changes (2 D,) of positions and velocities in each run.
         for linear, change in zip(self.linear, self.smoothed.states[:, 0], strict=True):
             joints = linear.trajectory.x.shape[1]
             velocities = slice(linear.positions, linear.positions + joints)
             changes.append(np.concatenate([change[:joints], change[velocities]]))
+        # First states (R, 2 D) of the motions about which the models are linear.
         simulated_starts = np.array(
             [
                 np.concatenate([linear.trajectory.x[0], linear.trajectory.v[0]])
@@ -586,6 +635,7 @@ class FollowedRuns:
                 for share in SMOOTHED_SHARES
             ]
         )
+        # For each share (rows) and each run (columns).
         squares = np.array([fitter.compute_squares(self.theta, states) for states in first_states])
         best: Array = first_states[np.argmin(squares, axis=0), np.arange(len(self.linear))]
         return best
@@ -593,8 +643,8 @@ class FollowedRuns:
     def estimate_settled_states(self, theta: Array) -> Array:
         """Return first states (R, 2 D) in contact equilibrium for a model with other parameters.
 
-        The depth of contacts and the motion depend on the parameters, so a filter with them
-        estimates the states. If it diverges, those of this filter are returned.
+        The depth of contacts and the motion depend on the parameters, so a new filter with these
+        parameters estimates the states. If it diverges, those of this filter are returned.
 
         Args:
             theta: (P,) parameters of the model of a robot on the ground.
@@ -629,9 +679,9 @@ class _NoiseFit(NamedTuple):
 def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array) -> _NoiseFit:
     """Fit the process noise and the correlation of the sensor noise by maximum likelihood.
 
-    The process noise is fitted with the given correlation first. Larger correlations φ of AR(1)
-    noise follow, in ascending order, each with the process noise fitted again, as long as the
-    log-likelihood increases.
+    The process noise, which stands for missing forces, is fitted with the given correlation first.
+    Larger correlations φ of AR(1) noise follow, in ascending order, each with the process noise
+    fitted again, as long as the log-likelihood increases.
 
     Args:
         runs: the linear models.
@@ -648,7 +698,9 @@ def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array
         if phi > given_phi
     ]
     for tried_noise in tried_noises:
+        # Models with states for the correlated noise, and the variances of the white noise.
         coloured, white = add_noise_states(runs, tried_noise)
+        # Filter with the process noise so far, and fit it only if the correlation is likelier.
         if best is not None:
             filtered = filter_runs(coloured, best.force, white)
             before, after = best.filtered.log_likelihood.sum(), filtered.log_likelihood.sum()
@@ -687,14 +739,15 @@ def linearise_run(
         noise: sensor noise of each channel.
         run: index of the run.
         trajectory: the motion; None to estimate or simulate it.
-        neighbour: model of the same run at other parameters, whose matrices are reused; None if
-            there is none.
+        neighbour: model of the same run at other parameters or about another motion, whose
+            matrices are reused; None if there is none.
         simulator: robot with other contact or friction settings; None for that of the evaluator.
         reuses_jacobians: whether derivatives of steps are taken from the neighbour.
         reuses_loads: whether the forces that transmissions carry are taken from the neighbour.
         first_state: first state from which a robot on the ground is simulated; None for that of
             the readings.
     """
+    # Half of the states are positions, the others velocities.
     half = len(evaluator.state_names) // 2
     scenario = evaluator.prepared_runs[run].scenario
     guess = evaluator.initial_state_guesses[run]
@@ -740,6 +793,7 @@ def _compute_prior_deviations(
         hidden states.
     """
     coordinates = evaluator.simulator.system.coordinates
+    # All other states, such as hidden states of effects, start at known values.
     prior = np.full(size, 1e-9)
     # Positions may include those of joints in series, which are no coordinates of the robot.
     position_count = linear[0].positions

@@ -54,9 +54,11 @@ def has_joint_forces(robot: RobotModel, recording: Recording) -> bool:
         recording: its recording; the channels of the first run count.
     """
     recorded = recording.runs[0].channels
+    # ``q.NAME`` is the channel of a joint's position.
     are_recorded = all(
         joint.has_one_coordinate and f"q.{joint.name}" in recorded for joint in robot.joints
     )
+    # `neq` is MuJoCo's number of equality constraints.
     return are_recorded and not robot.compiled.neq and bool(robot.actuators)
 
 
@@ -74,13 +76,17 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
 
     Returns:
         Forces that the motion requires, that the drives exert, and that would hold the robot still.
+        A drive that is recorded as off exerts no force.
     """
     model = robot.compiled
+    # Position, velocity and acceleration (T, 3) of each of the D joints, (D, T, 3) together.
     states = np.stack(track_joints(run.times, _get_readings(robot, recording, run)))
-    # Positions, velocities and accelerations (T, D) of D joints.
+    # (3, T, D)
     motion = np.transpose(states, (2, 1, 0))
+    # The same positions without velocity and acceleration.
     rest_motion = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
     controls, activations = _compute_controls(robot, run)
+    # Recorded external forces (T, D) at the joints.
     applied = np.zeros(motion.shape[1:])
     for column, joint in enumerate(robot.joints):
         name = f"force.{joint.name}"
@@ -89,10 +95,12 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
     needed, driven = motion_forces(model, robot.joints, motion, controls, activations)
     holding, _ = motion_forces(model, robot.joints, rest_motion, controls, activations)
     names = [joint.name for joint in robot.joints]
+    # By name of an actuator: the mask (T,) of the samples at which it is recorded as off.
     for name, off_mask in run.off.items():
         joint_name = robot.actuator(name).joint
+        # An actuator may act on something else than one joint.
         if joint_name is not None:
-            # Where the drive is known to be off, both hypotheses agree.
+            # Then the hypotheses "on" and "off" have the same residual there.
             driven[off_mask, names.index(joint_name)] = 0.0
     return JointForces(needed - applied, driven, holding - applied, motion[1])
 
@@ -110,6 +118,7 @@ def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[Joi
     readings = []
     for joint in robot.joints:
         columns, noise = [], []
+        # Channels of the position and the velocity.
         for name in (f"q.{joint.name}", f"qd.{joint.name}"):
             values = run.channels.get(name, np.full(run.times.size, np.nan))
             columns.append(values)
@@ -125,8 +134,8 @@ def _get_readings(robot: RobotModel, recording: Recording, run: Run) -> list[Joi
 def _compute_mean_input(run: Run, name: str) -> Array:
     """Return an input (T,) at each sample: the mean of its values before and after the sample.
 
-    An input is held between samples, so that it jumps at a sample. It is returned as it is if the
-    run interpolates it linearly.
+    An input is held between samples, so that it jumps at a sample. Before the first sample, it has
+    its first value. It is returned as it is if the run interpolates it linearly.
 
     Args:
         run: the run.
@@ -165,7 +174,8 @@ def _compute_controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
             controls[:, activation_filter.actuator.control]
         )
         activation = float(clipped_controls[0])
-        # The last sample has no step after it; its decay is not used.
+        # A lag decays exponentially to the control, which is constant in each step. The last sample
+        # has no step after it; its decay is not used.
         decays = np.exp(-np.append(steps, 0.0) / max(activation_filter.seconds, 1e-9))
         for sample, decay in enumerate(decays.tolist()):
             activations[sample, activation_filter.address] = activation

@@ -77,6 +77,7 @@ def _compute_measured_states(
     for joint, (coordinate, rate) in enumerate(zip(coordinates, rates, strict=True)):
         if coordinate not in evaluator.channels:
             continue
+        # Channel of the position.
         position = evaluator.channels.index(coordinate)
         if np.isfinite(observed[:, position]).sum() < 3:
             continue
@@ -114,6 +115,7 @@ def estimate_resting_position(readings: Array, sigma: float) -> float | None:
     """
     recorded = readings[np.isfinite(readings)]
     counts = np.arange(1, recorded.size + 1)
+    # Relative to the first reading (a slice, because there may be none), in units of the noise.
     scaled = (recorded - recorded[:1]) / sigma
     # Sums of squares about the mean of the first n = 1, 2, ... readings. At rest they are
     # chi-squared, with mean n - 1 and standard deviation of about sqrt(2 n).
@@ -121,6 +123,7 @@ def estimate_resting_position(readings: Array, sigma: float) -> float | None:
     moves = squares > counts - 1 + MAX_RESTING_DEVIATION * np.sqrt(2.0 * counts)
     # A single wrong reading among the first few is no motion.
     moves[: 2 * MIN_RESTING_READINGS] = False
+    # Number of readings before the first one that shows motion.
     resting_count = int(np.argmax(moves)) if moves.any() else recorded.size
     if resting_count <= 2 * MIN_RESTING_READINGS:
         return None
@@ -155,12 +158,14 @@ def track_joints(times: Array, readings: list[JointReadings]) -> list[Array]:
     """
     steps = np.diff(times)
     count, samples = len(readings), times.size
+    # Matrices of eq. (1): transitions (T - 1, 3, 3) of the state, and its responses (T - 1, 3, 1)
+    # to the jerk.
     transitions = np.tile(np.eye(3), (samples - 1, 1, 1))
     transitions[:, 0, 1] = transitions[:, 1, 2] = steps
     transitions[:, 0, 2] = 0.5 * steps**2
     jerk_responses = np.stack([steps**3 / 6.0, 0.5 * steps**2, steps], axis=1)[:, :, None]
     # The state is the deviation from a joint that rests at its first reading. Readings are in units
-    # of the noise, so that both channels have variance one.
+    # of the noise, so that both channels, position and velocity, have variance one.
     residuals = np.stack([joint.values for joint in readings])
     scale = np.stack([joint.sigma for joint in readings])[:, None]
     positions = residuals[:, :, 0].copy()
@@ -168,10 +173,12 @@ def track_joints(times: Array, readings: list[JointReadings]) -> list[Array]:
     residuals[:, :, 0] -= first_positions[:, None]
     recorded = np.isfinite(residuals)
     residuals = np.where(recorded, residuals, 0.0) / scale
+    # Missing readings do not depend on the state.
     observation_matrices = np.zeros((count, samples, 2, 3))
     observation_matrices[..., 0, 0] = 1.0 / scale[..., 0]
     observation_matrices[..., 1, 1] = 1.0 / scale[..., 1]
     observation_matrices[~recorded] = 0.0
+    # Range of each joint's positions (D,), at least their noise, as a scale of the jerks.
     position_ranges = np.maximum(
         np.nanmax(positions, axis=1) - np.nanmin(positions, axis=1), scale[:, 0, 0]
     )
@@ -194,9 +201,11 @@ def track_joints(times: Array, readings: list[JointReadings]) -> list[Array]:
         prior=prior,
         jumps=zeros,
     ).subset(np.repeat(joint_indices, jerk_count))
+    # Standard deviation of the jerk of each of these runs.
     jerks = (position_ranges[:, None] * JERKS / span**3).reshape(-1, 1)
     filtered = filter_runs(runs, jerks, np.ones(2))
     log_likelihoods = filtered.log_likelihood.reshape(count, jerk_count)
+    # Indices of the runs with the likeliest jerk of each joint.
     likeliest = np.argmax(log_likelihoods, axis=1) + jerk_count * joint_indices
     best_runs = runs.subset(likeliest)
     smoothed = smooth_runs(best_runs, filtered.subset(likeliest), jerks[likeliest])

@@ -70,7 +70,9 @@ class FirstStateFactors(NamedTuple):
 
 
 def get_state_noise(evaluator: RunEvaluator, noise: NoiseModel) -> tuple[Array, Array]:
-    """Return the noise (D,) of positions, and that of velocities if they are differences of these.
+    """Return the noise (D,) of positions, and that of velocities computed from their differences.
+
+    Both are standard deviations, those of velocities per second.
 
     Args:
         evaluator: the runs of a robot on the ground, whose joints are recorded.
@@ -100,6 +102,8 @@ def settle_first_state(
 ) -> tuple[Array, Array]:
     """Return the first positions and velocities (D,) of a run at which contacts are in equilibrium.
 
+    From there, a simulation does not begin with a jump.
+
     Args:
         evaluator: the runs of a robot on the ground.
         simulator: simulator of the robot, perhaps with other contact settings than the evaluator's.
@@ -112,6 +116,7 @@ def settle_first_state(
     if first_state is None:
         x, v = np.split(evaluator.initial_state_guesses[run].copy(), 2)
         weights = None
+        # Position, velocity and acceleration of each recorded joint at the first sample.
         for joint, states in estimate_measured_states(evaluator, noise.sigma, run).items():
             x[joint], v[joint], _ = states[0]
     else:
@@ -140,11 +145,14 @@ class FirstStateFitter:
     @cached_property
     def factors(self) -> FirstStateFactors:
         """QR factors of what the readings and the prior tell about the first states of each run."""
+        # Derivatives H of the readings (R, T, C, 2 D) in units of the noise, and the rows for the
+        # prior standard deviations p, diag(1 / p).
         derivatives = self.scale_by_noise(self.sensitivities)
         prior = np.diag(1.0 / compute_measured_state_prior(self.evaluator, self.noise))
+        # Q R = [H; diag(1 / p)] of each run.
         factors = [
-            np.linalg.qr(np.concatenate([of_run.reshape(-1, len(prior)), prior]))
-            for of_run in derivatives
+            np.linalg.qr(np.concatenate([run_derivatives.reshape(-1, len(prior)), prior]))
+            for run_derivatives in derivatives
         ]
         return FirstStateFactors(np.array([f.Q for f in factors]), np.array([f.R for f in factors]))
 
@@ -176,8 +184,11 @@ class FirstStateFitter:
         runs = np.arange(len(states))
         squares = self.compute_squares(theta, states)
         for _ in range(MAX_FIRST_STATE_STEPS):
+            # One row for each run.
             residuals = self.simulate_residuals(theta, states).reshape(len(states), -1)
-            # Q has further rows for the prior, whose residual is zero at the present states.
+            # The Gauss-Newton step solves R step = Q' residual with the QR factors of the
+            # derivatives. Q has further rows for the prior, whose residual is zero at the present
+            # states.
             steps = np.array(
                 [
                     np.linalg.solve(r, q[: residual.size].T @ residual)
@@ -191,6 +202,7 @@ class FirstStateFitter:
                 all_squares.append(self.compute_squares(theta, tried[-1]))
             best = np.argmin(all_squares, axis=0)
             states, new_squares = np.array(tried)[best, runs], np.array(all_squares)[best, runs]
+            # The sum of squares over all runs hardly decreases.
             is_converged = new_squares.sum() > (1.0 - MIN_STEP_DECREASE) * squares.sum()
             squares = new_squares
             if is_converged:
@@ -257,7 +269,8 @@ class FirstStateFitter:
             states: (R, 2 D) positions and velocities of D coordinates in R runs.
             is_other_geometry: whether the states may be those of another geometry, so that contacts
                 farther apart may be closed.
-            known_jacobians: derivatives of contacts for each run, see `settle_contacts`.
+            known_jacobians: derivatives of contacts for each run, see `settle_contacts`; None to
+                compute them.
         """
         simulator = self.evaluator.simulator
         assert isinstance(simulator, RobotSimulator)
