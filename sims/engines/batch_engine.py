@@ -77,10 +77,14 @@ class BatchEngine:
 
         Args:
             batch: Systems, initial states, inputs and effects of all elements.
+
+        Returns:
+            Positions, velocities and accelerations at the initial state and after each
+            `batch.steps_per_sample` steps.
         """
         trajectories = integrate_batch(batch, self._max_phase, self._patience, self._jobs)
-        # Values that are not finite stay so; therefore the last state shows whether the whole run
-        # is.
+        # A value that overflows stays infinite or NaN until the end; therefore the last state shows
+        # whether the whole run is finite.
         is_finite = np.isfinite(trajectories.x[:, -1]) & np.isfinite(trajectories.v[:, -1])
         failed = ~is_finite.all(axis=1)
         if failed.any():

@@ -48,11 +48,15 @@ class ScenarioGroups:
 def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> ScenarioGroups:
     """Group scenarios with the same times and inputs.
 
-    Inputs and time steps are computed once for each group, not for each batch element.
+    Inputs and time steps are computed once for each group, not for each batch element. The inputs
+    include their interpolation, offset and history before the run, and when actuators are off.
 
     Args:
         scenarios: Scenario of each batch element.
         by_initial: Whether grouped scenarios must also state the same initial states.
+
+    Returns:
+        The first scenario of each group, and the number of the group of each batch element.
     """
     # Compare objects first, because comparing the contents of each scenario is slow.
     objects, object_index = group_by_identity(scenarios)

@@ -90,7 +90,8 @@ def compute_applied_inputs(
             for lead_part, run_part in zip(lead_in, (starts, ends, steps), strict=True)
         )
     step_ends = ends
-    # Backwards from the plant to the command: map the times through the effects.
+    # Backwards from the plant to the command: from the times at which a value is applied, find the
+    # times at which it was commanded.
     for effect, c, is_acting in reversed(effects):
         assert isinstance(effect, Input)
         # Most effects do not shift time; skip them.
@@ -102,6 +103,8 @@ def compute_applied_inputs(
     has_uniform_steps = plan.has_uniform_steps or ends.strides[0] == 0
     means = _average_command(runs, input_name, commands, starts, ends, has_uniform_steps)
     for effect, c, is_acting in effects:
+        # The first coefficient of such an effect is the share of the other interpolation: linear
+        # for an input that is held between samples, and held for a linear one.
         if isinstance(effect, Input) and effect.between:
             other_means = _average_command(
                 runs,
@@ -281,7 +284,8 @@ def _average_command(
 def _average_held_signal(times: Array, values: Array, starts: Array, end: Array) -> Array:
     """Return the means of a held signal over intervals; its value where an interval has no length.
 
-    The mean over (a, b) is (A(b) - A(a)) / (b - a) (1), with the integral A of the signal.
+    The mean over (a, b) is (A(b) - A(a)) / (b - a) (1), with the integral A of the signal. The
+    signal has its first value before the first sample, and its last value after the last one.
 
     Args:
         times: (T,) times from which the values hold, s.

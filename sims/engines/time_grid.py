@@ -76,19 +76,24 @@ def build_time_grid(
 ) -> TimeGrid:
     """Build steps through all times at which a sample is taken or a changed command is applied.
 
-    A sample before the start shows the initial state. Shorter runs wait at their end.
+    Without effects that shift time, and without offsets between inputs and samples, commands change
+    at samples only, so that the steps depend on the scenario alone. A sample before the start shows
+    the initial state. Shorter runs wait at their end, in steps of zero length.
 
     Args:
         runs: Scenarios of the batch elements.
         commands: Inputs of each distinct scenario.
         effects: Effects on input and sensors.
         largest_step: Maximum length of a step, s.
+
+    Returns:
+        The steps of each batch element, and the number of the stored state for each sample.
     """
     samples = max(s.times.size for s in runs.unique_scenarios)
     instants = np.stack([pad_with_last(_sample_times(s), samples) for s in runs.unique_scenarios])
     shifting = [(e, c) for e, c in effects if c.any() and shifts_time(e)]
     if not shifting and not any(s.offset for s in runs.unique_scenarios):
-        # Runs with the same sample times share one row and everything computed from it.
+        # Scenarios with the same sample times share one row and everything computed from it.
         if (instants == instants[:1]).all():
             instants = instants[:1]
         steps, step_ends, steps_per_sample, rows = divide_intervals(instants, largest_step)
@@ -159,9 +164,10 @@ def _find_change_times(
 def divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Array, int, Indices]:
     """Divide the intervals between times into equal steps.
 
-    The steps are arranged in blocks of the most frequent number of steps per interval; steps of
-    zero length fill the last block of an interval. The steps of a batch element do not depend on
-    others.
+    All steps of a batch element are stored in blocks with the same number of steps, after each of
+    which the engine stores a state. This number is the most frequent one of the steps that an
+    interval needs; steps of zero length fill the last block of an interval. For example, if most
+    intervals need 4 steps, an interval with 5 has two blocks, whose last three steps are zero.
 
     Shapes: S steps, T samples.
 

@@ -69,13 +69,20 @@ def evaluate_forces(block: Block) -> None:
 
 
 def begin_step(block: Block) -> None:
-    """Compute the accelerations at the beginning of a step, in rows K1, by equations (1) to (3).
+    """Compute the accelerations at the beginning of a step, in rows K1, with dry friction.
 
-    The forces must be evaluated before. Three results are constant during the step, so that the
-    step is smooth: which elements stick (dry friction holds them at rest), the direction of motion
-    of the others, and the excess, the pulling force minus the limit of dry friction. Friction acts
-    on the first coordinates only; systems without friction, and those with one such coordinate,
-    have faster versions.
+    With the mass M, the pulling force F (all forces except dry friction), the limit L of dry
+    friction and the velocity v,
+
+        M a = F - L v / |v|    while it moves                (1)
+        a = 0                  at rest, as long as |F| <= L  (2)
+        M a = F - L F / |F|    at rest, where |F| > L        (3)
+
+    The forces must be evaluated before. Two results stay the same during the step, so that the
+    step is smooth: which elements stick (2), and the direction v / |v| or F / |F| of the others.
+    The excess |F| - L is stored, too: where it becomes positive, a sticking element breaks away.
+    Friction acts on the first coordinates only; systems without friction, and those with one such
+    coordinate, have faster versions.
 
     Args:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
@@ -99,6 +106,7 @@ def begin_step(block: Block) -> None:
         compute_force_without_friction(block, i, K1)
         force_size = compute_norm(a, K1, friction_coordinate_count, i)
         speed = compute_norm(a, V, friction_coordinate_count, i)
+        # The later stages of the step overwrite EXCESS_AFTER.
         a[EXCESS_BEFORE, i] = force_size - limit
         a[EXCESS_AFTER, i] = force_size - limit
         is_still = speed == 0.0
@@ -122,8 +130,10 @@ def begin_step_1d(block: Block) -> None:
     """Compute the accelerations of all slots at the beginning of a step, in rows K1.
 
     This is the version of `begin_step` for dry friction on the first coordinate only, without
-    ground; the numbers are the same. All cases are computed and one is selected, without branches,
-    so that the compiler can vectorise the loop over slots.
+    ground; the numbers are the same. With the force F, the friction limit L and the velocity v, it
+    is M a = F - L v / |v| in motion (1); at rest a = 0 if |F| <= L (2), else M a = F - L F / |F|
+    (3). All cases are computed and one is selected, without branches, so that the compiler can
+    vectorise the loop over slots.
 
     Args:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
@@ -150,6 +160,7 @@ def begin_step_1d(block: Block) -> None:
         friction = limit * direction
         slip_acceleration = (force - friction) / a[MASS, i]
         is_held = is_still and force_size <= limit
+        # The later stages of the step overwrite EXCESS_AFTER.
         a[EXCESS_BEFORE, i] = excess
         a[EXCESS_AFTER, i] = excess
         a[DIRECTION, i] = direction
@@ -258,7 +269,9 @@ def compute_acceleration_nd(block: Block, i: int, row_of_result: int, friction_r
     friction_coordinate_count = block.flags[FRICTION_COORDINATE_COUNT]
     velocity = block.rows[IN_V]
     limit = block.r[block.rows[OUT_LIMIT], i]
+    # At first, the rows of the result hold forces; below, they are divided by the mass.
     compute_force_without_friction(block, i, row_of_result)
+    # Where the excess becomes positive, a sticking element breaks away.
     a[EXCESS_AFTER, i] = compute_norm(a, row_of_result, friction_coordinate_count, i) - limit
     # The direction may turn within the step, but must not reverse: a reversal is an event at which
     # the step is cut.
@@ -348,6 +361,8 @@ def compute_frictionless_acceleration(block: Block, row_of_result: int) -> None:
         for i in range(block.w):
             a[row, i] = block.r[force_row, i] / a[MASS, i]
     if block.flags[BOUNCES] != 0:
+        # The last coordinate is the height. The ground pushes but does not pull: an upward force
+        # remains.
         last_row = row_of_result + d - 1
         for i in range(block.w):
             if block.n[IS_RESTING, i] != 0:

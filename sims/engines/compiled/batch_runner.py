@@ -40,8 +40,9 @@ def integrate_batch(
     """Integrate the motion of all elements of a batch in machine code.
 
     Elements with the same active effects have the same force program (see `force_program`), so
-    they are grouped by effects, and each group is integrated with its program. With hidden states
-    of effects, a group has coordinates of its own, and arrays of its own.
+    they are grouped by effects, and each group is integrated with its program. A hidden state of an
+    effect (such as the position of a load on an elastic gear, whose motor alone is measured) is one
+    more coordinate, so that groups with hidden states need arrays of their own.
 
     Args:
         batch: batch to integrate.
@@ -50,7 +51,7 @@ def integrate_batch(
         jobs: number of threads.
 
     Returns:
-        The trajectories.
+        Positions, velocities and accelerations of the system's own coordinates.
     """
     # Loaded first, so that an error of the compiler is not reported as an error of the system.
     COMPILED.load()
@@ -61,9 +62,11 @@ def integrate_batch(
     for elements, effects in _group_by_effects(batch):
         arrays = all_elements._replace(order=elements.astype(np.int64))
         hidden = [(e, c[:, elements]) for e, c in effects if isinstance(e, HiddenStateEffect)]
-        if hidden:  # records of another width, of which the system's own coordinates are copied
+        # With hidden states, records are wider; the system's own coordinates are copied below.
+        if hidden:
             arrays = _make_arrays(batch.select(elements), hidden, max_phase, patience)
         program = get_force_program(batch, elements, [effect for effect, _ in effects])
+        # Parameters of the program: the system's parameters and constants, then the coefficients.
         columns = [batch.theta[elements], *(c[elements] for c in batch.constants.values())]
         columns += [c[:, elements, 0].T for _, c in effects]
         parameters = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype=np.float64)
@@ -86,12 +89,14 @@ def _make_arrays(
     steps is stored for all.
 
     Args:
-        batch: batch: system, initial states, inputs and effects of all elements.
-        hidden: effects with a hidden state in all elements, with their coefficients.
+        batch: system, initial states, inputs and effects of all elements.
+        hidden: effects with a hidden state in all elements, with their coefficients (K, L, 1). The
+            hidden states become the last coordinates.
         max_phase: maximum phase of an oscillation per step in radians; see `step_size`.
         patience: maximum number of steps of an element, as a multiple of the planned ones.
     """
     count, system = len(batch.x), batch.system
+    # `fastest` is the maximum angular frequency of oscillations that forces do not show, rad/s.
     x, v, fastest = batch.x, batch.v, system.fastest
     if hidden:
         start = np.zeros((count, 1))
@@ -149,6 +154,7 @@ def _integrate_group(program: ForceProgram, arrays: BatchArrays, jobs: int) -> N
         width = min(program.program.block_width, padded_count)
         prepared, layout = program.prepare(width)
         integrate_elements(layout, part, allocate_block(prepared.r), width)
+        # An exception in a user's force cannot pass through machine code; it is raised here.
         prepared.raise_error()
 
     # Every thread has its own buffers. No two threads write the same element, and the result of an
@@ -191,8 +197,8 @@ def _get_ground_parameters(batch: IntegrationBatch) -> Array:
     """Return the parameters (4, L) of the ground for each of L elements.
 
     The rows are the height of the ground, the coefficients of restitution and friction, and the
-    minimum share of the tangential speed that remains after an impact. All are zero for systems
-    that do not bounce.
+    minimum share of the tangential speed that remains after an impact (1 minus the `grip`, the
+    largest share that an impact removes). All are zero for systems that do not bounce.
 
     Args:
         batch: Elements to integrate.
@@ -216,8 +222,11 @@ def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple
     """Group the elements by their active effects, since each group needs its own force program.
 
     Only effects that are part of a force program count: forces, friction, contact laws and hidden
-    states. An effect is active in an element if its coefficients there are not zero; one with a
-    hidden state, if the first is above zero.
+    states. An effect is active in an element if its coefficients there are not all zero; one with a
+    hidden state is off, by definition, unless its first coefficient is above zero.
+
+    Args:
+        batch: batch of L elements, with the coefficients (K, L, 1) of their effects.
 
     Returns:
         Indices (n,) of each group's elements, and its effects with coefficients (K, L, 1).
@@ -229,7 +238,7 @@ def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple
     ]
     if not effects:
         return [(np.arange(len(batch.x)), [])]
-    # Row l: whether each effect acts in element l.
+    # (L, number of effects): whether each effect acts in each element.
     patterns = np.stack(
         [
             c[0, :, 0] > 0 if isinstance(e, HiddenStateEffect) else is_active(c)[:, 0]

@@ -84,8 +84,9 @@ class ProgramArrays(NamedTuple):
             friction of the ground.
         out: (D,) registers of the force.
         flags: (6,) number of dimensions D; whether dry friction acts; whether forces of effects
-            act; whether it bounces; number of coordinates, counted from the first, on which dry
-            friction acts; whether the system has hidden states.
+            act, or the system's own force may change sharply; whether it bounces; number of
+            coordinates, counted from the first, on which dry friction acts; whether the system has
+            hidden states, or its own force may change sharply.
     """
 
     code: IntTable
@@ -271,7 +272,9 @@ def check_block(block: Block) -> None:
     Raises:
         ValueError: an array is not as specified.
     """
-    # Sizes by the letters of `BLOCK_SHAPES`.
+    # Sizes by the letters of `BLOCK_SHAPES`: d coordinates, l elements of which s are selected, t
+    # steps, u inputs, p parameters, w slots, y records of z numbers, r registers, q entries of
+    # `rows`, a and n rows of the buffers; k rows of steps and j rows of inputs.
     sizes = measure_arrays(BLOCK_SHAPES, block)
     d, elements, steps, rows = sizes["d"], sizes["l"], sizes["t"], block.rows
     # Numbers of registers for positions, inputs and parameters. They are consecutive groups, and

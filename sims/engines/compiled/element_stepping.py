@@ -141,8 +141,16 @@ def try_step(block: Block) -> None:
     """Try a step of H seconds of every element by the classical Runge-Kutta method.
 
     The acceleration k1 at the beginning is in rows K1. Stages 1 and 2 evaluate k2 and k3 in the
-    middle of the step, stage 3 evaluates k4 at its end, by equations (2) to (6) of this module. The
-    new state is stored in rows NEXT_X and NEXT_V; the element moves there only if the step is
+    middle of the step, stage 3 evaluates k4 at its end. With the acceleration a(t, x, v) and the
+    step h,
+
+        k2 = a(t + h/2, x + h/2 v, v + h/2 k1)               (2)
+        k3 = a(t + h/2, x + h/2 v + h^2/4 k1, v + h/2 k2)    (3)
+        k4 = a(t + h, x + h v + h^2/2 k2, v + h k3)          (4)
+        x' = x + h v + h^2/6 (k1 + k2 + k3)                  (5)
+        v' = v + h/6 (k1 + 2 k2 + 2 k3 + k4)                 (6)
+
+    The new state is stored in rows NEXT_X and NEXT_V; the element moves there only if the step is
     accepted.
 
     Args:
@@ -171,7 +179,7 @@ def try_step(block: Block) -> None:
                 for i in range(block.w):
                     half_step = 0.5 * a[H, i]
                     r[x, i] = r[x, i] + (half_step * half_step) * a[K1 + k, i]  # (3)
-            else:  # the register of the velocity still has v + h/2 k2
+            else:  # h times v + h/2 k2, which the register of the velocity still has
                 for i in range(block.w):
                     r[x, i] = a[X + k, i] + a[H, i] * r[v, i]  # (4)
             for i in range(block.w):

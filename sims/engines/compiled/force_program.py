@@ -123,6 +123,9 @@ def _find_program(
 ) -> Program:
     """Return the traced program of a system and its effects, or one that NumPy evaluates.
 
+    A trace calls a Python function once with symbols, and records its arithmetic as instructions.
+    System and effects are first traced one by one, so that a message can name the one that fails.
+
     Args:
         batch: whole batch.
         first: (1,) index of an element, at whose initial state programs are compared with NumPy.
@@ -132,6 +135,7 @@ def _find_program(
     system = batch.system
 
     def make_test(*own_effects: Effect) -> tuple[ArrayFunction, list[Array]]:
+        """Return the function of the system with these effects alone, and inputs to compare at."""
         samples = _make_samples(batch, first, own_effects)
         return _make_function(system, names, own_effects), samples
 
@@ -146,21 +150,23 @@ def _find_program(
 
 
 def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]) -> ArrayFunction:
-    """Return the array function of a system and its effects.
+    """Return the function that computes the forces of a system and its effects from their inputs.
 
-    The groups of inputs are time, position, velocity, inputs, parameters; restitution and friction
-    of the ground, and speed of an impact. Positions, velocities and forces are those of the system,
-    followed by those of hidden states. The parameters are those of the system, its constants, and
-    the coefficients of each effect. The outputs are the force and the limit of dry friction;
-    restitution and friction with effects.
+    It can be traced into instructions, or evaluated with NumPy. It has two parts. One computes the
+    force and the limit of dry friction from time, position, velocity, inputs and parameters. The
+    other computes restitution and friction of an impact with effects, from those of the ground and
+    the impact speed. Positions, velocities and forces are those of the system, followed by those of
+    hidden states. The parameters are those of the system, its constants, and the coefficients of
+    each effect.
 
     Args:
         system: system whose forces are evaluated.
         names: names and sizes of its inputs.
         effects: effects that act.
     """
-    own = names.coordinates
+    own = names.coordinates  # number of the system's own coordinates
     d = own + _count_hidden_states(effects)
+    # Sizes of the consecutive groups of parameters: those of the system, constants, coefficients.
     sizes = [names.parameters, *(1 for _ in names.constants)]
     sizes += [len(effect.coefficients) for effect in effects]
 
@@ -189,9 +195,13 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
         moment = StateSnapshot(system, theta, constants, t, x[:, :own], v[:, :own], inputs)
 
         def evaluate_forces() -> tuple[Any, Any]:
-            """Return the force, and the limit of dry friction."""
+            """Return the generalised force (L, d), and the limit (L, 1) of dry friction.
+
+            The rate r of a hidden state is returned as the force M' r, because the engine divides
+            all forces by the inertia M' of the system's own coordinates.
+            """
             force = system.force(moment)
-            limit: Any = None
+            limit: Any = None  # None instead of zero saves an addition in the traced program
             hidden_forces: list[Any] = []
             for effect, c in acting:
                 if isinstance(effect, Force):
@@ -200,7 +210,7 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
                     added = effect.limit(c, moment)
                     limit = added if limit is None else limit + added
                 elif isinstance(effect, HiddenStateEffect):
-                    k = own + len(hidden_forces)
+                    k = own + len(hidden_forces)  # coordinate of this hidden state
                     added, rate = effect.act(c, moment, HiddenState(x[:, k, None], v[:, k, None]))
                     force = force + added
                     hidden_forces.append(inertia * rate)
@@ -232,7 +242,10 @@ def compute_own_inertia(
     constants: Mapping[str, Array],
     acting: Sequence[tuple[Effect, Array]],
 ) -> Array:
-    """Return the inertia (L, 1) that remains for the system's own coordinates, by eq. (1).
+    """Return the inertia (L, 1) that remains for the system's own coordinates.
+
+    It is M' = M (1 - sum of the shares) (1): an elastic element, for example, moves a share of the
+    inertia M behind it, to its hidden coordinate.
 
     Args:
         system: the system.
@@ -262,7 +275,7 @@ def _make_samples(
     Args:
         batch: whole batch.
         first: (1,) index of the element.
-        effects: effects of the program.
+        effects: effects of the program, a part of those of the batch.
     """
     coefficients = [c[:, first, 0].T for active, c in batch.effects if active in effects]
     constants = [values[first] for values in batch.constants.values()]
@@ -295,7 +308,8 @@ def _make_flags(system: System, names: _InputNames, effects: Sequence[Effect]) -
     has_forces = any(isinstance(effect, Force) for effect in effects)
     hidden_count = _count_hidden_states(effects)
     bends = system.bends or hidden_count > 0
-    # In the order of the constants from DIMENSIONS to HAS_HIDDEN_STATES.
+    # In the order of the constants from DIMENSIONS to HAS_HIDDEN_STATES. The last one is also set
+    # for a system whose own force may change sharply: both need fine steps.
     flags = (
         names.coordinates + hidden_count,
         has_friction,

@@ -90,6 +90,12 @@ def load_callback(offsets: Mapping[str, int]) -> Callable[..., None]:
     Raises:
         InputError: the compiler or its machine code cannot be used.
     """
+    # The compiler replaces the module's constants, such as QPOS, by these offsets.
     constants = {name.upper(): offset for name, offset in offsets.items()}
-    entry = "add_effect_forces"
-    return load_stored(mujoco_callback.__name__, entry, "the forces of effects", 2, constants)
+    return load_stored(
+        mujoco_callback.__name__,
+        "add_effect_forces",
+        "the forces of effects",
+        pointers=2,  # MuJoCo's model and data
+        constants=constants,
+    )

@@ -145,6 +145,7 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
     context = CallbackContext(*to_fixed_tuple(words, CONTEXT_WORDS))
     k, stage = divmod(context.evaluation, context.evaluations_per_step)
     words[EVALUATION] += 1
+    # There are no inputs for an evaluation after the last step.
     if k >= context.steps:
         return
     joints = context.joints
@@ -160,7 +161,8 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
         r = carray(to_real_pointer(context.registers), (context.register_count, 1))
         r[context.t, 0] = k * step
         r[context.midpoint, 0] = (k + 0.5) * step
-        # Time since the last evaluation, over which hidden states advance.
+        # Time since the last evaluation, over which hidden states advance: from midpoint to
+        # midpoint, and in the first step from its beginning.
         r[context.past, 0] = step if k > 0 else 0.5 * step
         for j in range(joints):
             r[context.x + j, 0] = qpos[positions[j]]
@@ -190,6 +192,7 @@ def add_effect_forces(model_at: Any, data_at: Any) -> None:  # noqa: ARG001
             scratch[joints + i] = r[next_states[i], 0]
         for i in range(context.states):
             r[context.first_state + i, 0] = scratch[joints + i]
+    # An address of zero means that there are no constraints now.
     if context.friction_rows > 0 and data[EFC_TYPE] != 0:
         set_friction_limits(data, context, scratch)
 
@@ -214,6 +217,7 @@ def set_friction_limits(data: Any, context: Any, limits: Any) -> None:
     while kinds[first] == EQUALITY_ROW:
         first += 1
     for row in range(first, first + context.friction_rows):
+        # Rows of other types must not be changed, should there be fewer rows of friction.
         if kinds[row] != FRICTION_ROW:
             break
         for j in range(context.joints):

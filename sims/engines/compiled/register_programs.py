@@ -169,11 +169,15 @@ class PreparedProgram:
     def _evaluate_part(self, part: int, width: int) -> None:
         """Evaluate one part of the program for the first `width` slots (called by machine code).
 
-        Values that depend on parameters alone are not separated here, so that part 0 does nothing.
         An exception cannot pass through machine code: it is stored, all results are NaN from
         then on, and the caller raises it afterwards.
+
+        Args:
+            part: 0 for the values that depend on parameters alone, 1 for those of an evaluation,
+                2 for those of an impact.
+            width: number of slots in use.
         """
-        # Part 0 has the values that depend on parameters alone.
+        # NumPy computes the values of part 0 again in each evaluation, so that part 0 does nothing.
         if not 0 < part <= len(self.program.outputs):
             return
         outputs = self.program.outputs[part - 1]
@@ -197,8 +201,9 @@ class PreparedProgram:
 def make_numpy_program(function: ArrayFunction) -> Program:
     """Return a program whose instructions call the function, one for each part.
 
-    Its registers are the inputs, followed by the values of each output. `PreparedProgram` makes the
-    instructions, which contain an address of this process.
+    Its registers are the inputs, followed by the values of each output. The instructions are only
+    reserved here, as zeros: `PreparedProgram` makes them, since they contain an address of this
+    process.
     """
     ends = np.cumsum([function.input_ends[-1], *(n for part in function.outputs for n in part)])
     output_bounds = iter(pairwise(ends.tolist()))

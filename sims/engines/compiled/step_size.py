@@ -127,7 +127,7 @@ def divide_steps(block: Block) -> None:
             block.max_steps[element] = block.max_steps[element] / division * (1.0 + 1e-9)
         if block.flags[HAS_HIDDEN_STATES] != 0:
             # The number of steps of an element is limited to a multiple of the planned ones. The
-            # fine steps that hidden states need count as planned steps.
+            # fine steps that hidden states, and a system with sharp forces, need count as planned.
             block.planned_counts[element] *= division
 
 
@@ -252,6 +252,7 @@ def update_max_slope(block: Block, k: int, register: int, row_of_result: int) ->
         slope = abs(change / (FINITE_DIFFERENCE_STEP * a[MASS, i]))
         if slope > a[row_of_result, i]:
             a[row_of_result, i] = slope
+    # The rows X and V of the block still have the unchanged state.
     block_row = (X if row_of_result == MAX_ACCELERATION else V) + k
     for i in range(block.w):
         block.r[register + k, i] = a[block_row, i]
@@ -305,6 +306,7 @@ def shorten_if_nonlinear(block: Block, i: int) -> bool:
             outer_sum = a[K1 + k, i] + a[K4 + k, i]
             middle_sum = a[K2 + k, i] + a[K3 + k, i]
             squared_change += (outer_sum - middle_sum) * (outer_sum - middle_sum)
+        # The tolerance and MAX_ACCELERATION are squares, too.
         is_nonlinear = squared_change > FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
     if block.flags[HAS_FRICTION] != 0:
         largest = nan_maximum(compute_norm(a, F1, d, i), compute_norm(a, F4, d, i))
@@ -314,6 +316,7 @@ def shorten_if_nonlinear(block: Block, i: int) -> bool:
         for k in range(d):
             change = a[F1 + k, i] - a[F2 + k, i] - a[F3 + k, i] + a[F4 + k, i]
             squared_change += change * change
+        # In one dimension, the root of the square would be rounded.
         change_size = abs(change) if d == 1 else np.sqrt(squared_change)
         tolerance = FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(a[MAX_FRICTION, i], negligible)
         if block.n[IS_STICKING, i] == 0 and change_size > tolerance:

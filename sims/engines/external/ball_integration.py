@@ -146,6 +146,10 @@ def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
 
     A ball that diverges ends the integration early.
 
+    Args:
+        ball: Ball in the engine.
+        element: Batch element: initial state, steps, constants and effects.
+
     Returns:
         Positions, velocities and accelerations (N, 3); NaN if the integration failed.
     """
@@ -259,9 +263,10 @@ class BallRollout:
     def _advance_without_impact(self, step: float) -> None:
         """Advance by one step of `step` seconds in flight or at rest.
 
-        The engine's velocity w belongs to the time half a step before the position. The applied
-        force per unit mass, (v + h/2 a - w) / h - g (4), makes the velocity v' = w' + h/2 a' (3)
-        of second order in the step h.
+        With the velocity v and the acceleration a at the position, the engine's velocity w belongs
+        to the time half a step earlier. The applied force per unit mass in addition to gravity g,
+        (v + h/2 a - w) / h - g (4), makes w' = v + h/2 a. The velocity after the step,
+        v' = w' + h/2 a' (3), is then of second order in the step h.
         """
         half_step = 0.5 * step
         wx, wy, wz = self._prepare_step(step)
@@ -391,6 +396,10 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
     The smooth acceleration is g + f - k v (1 + |v|), with the effects' force f per unit mass and
     the engine's air damping k (6).
 
+    Args:
+        ball: Ball in the engine, with the engine's own contact.
+        element: Batch element: initial state, steps, constants and effects.
+
     Returns:
         Positions, velocities and accelerations (N, 3); NaN if the integration failed.
     """
@@ -438,6 +447,7 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
             recorded_states.append((*x, *w, *compute_force(t, x, w)))
             if not math.isfinite(sum(recorded_states[-1])):
                 break
+    # The engine reports no acceleration: it is computed from the effects' forces.
     positions, v, effect_forces = make_trajectory(element, recorded_states)
     speed = np.sqrt((v * v).sum(axis=1, keepdims=True))
     a: Array = np.array([gx, gy, gz]) + effect_forces - ball.damping * v * (1.0 + speed)  # (6)

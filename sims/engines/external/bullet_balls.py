@@ -72,7 +72,8 @@ class _BulletMover:
         p = bullet_world.import_pybullet()
         mass = self._mass
         newtons = mass * force[0], mass * force[1], mass * force[2]
-        p.applyExternalForce(self._body, -1, newtons, self._x, p.WORLD_FRAME, self._client)
+        base = -1  # Bullet's index of the body itself; others are its links
+        p.applyExternalForce(self._body, base, newtons, self._x, p.WORLD_FRAME, self._client)
         p.stepSimulation(self._client)
         self._x, _ = p.getBasePositionAndOrientation(self._body, self._client)
         velocity, _ = p.getBaseVelocity(self._body, self._client)
@@ -163,13 +164,16 @@ class BulletNativeBall(_BulletMover):
     def set_contact_parameters(self, restitution: float, friction: float) -> None:
         """Set the ball's restitution and the friction of the contact.
 
-        `friction` is added to that of the settings, which is the product of both bodies'
-        coefficients.
+        Bullet uses the product of the friction coefficients of both bodies. In the settings, both
+        have the same coefficient f. With `friction`, the product is f^2 + friction.
+
+        Args:
+            restitution: Ratio of normal speeds after and before an impact.
+            friction: Friction coefficient of effects, added to that of the settings.
         """
         if (restitution, friction) == self._contact:
             return
-        # The contact uses the product of both bodies' friction. With 1 for the ground, the ball's
-        # coefficient is the product from the settings plus the friction of the effect.
+        # With 1 for the ground, the ball's coefficient is the whole product.
         ball_friction = self._lateral_friction
         ground_friction = self._lateral_friction
         if friction:
@@ -177,7 +181,9 @@ class BulletNativeBall(_BulletMover):
             ground_friction = 1.0
         pybullet = bullet_world.import_pybullet()
         _, previous_friction = self._contact
-        if friction or previous_friction:  # NaN before the first call
+        # Without friction of effects, the coefficients of the settings are set already, except
+        # after a call with friction, or before the first call, where the former value is NaN.
+        if friction or previous_friction:
             floor = pybullet.getBodyUniqueId(0, self._client)
             for body, value in ((floor, ground_friction), (self._body, ball_friction)):
                 pybullet.changeDynamics(

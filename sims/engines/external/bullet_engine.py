@@ -110,6 +110,12 @@ class BulletEngine:
         a system that bounces gets impacts at their exact times, and any other system is a
         body on a joint.
 
+        Args:
+            system: System that the engine will integrate.
+            largest_step: Longest step, s.
+            native_settings: Bullet's damping, friction and restitution by name; None for exact
+                impacts.
+
         Raises:
             InputError: Bullet cannot simulate the system.
         """

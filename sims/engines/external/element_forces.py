@@ -38,14 +38,16 @@ class ElementForces:
     def __init__(self, element: ElementWork, states: int) -> None:
         """Write the element's parameters into the registers, and find the offsets of numbers.
 
-        A register holds one number for each of the `states`. The offsets are positions of
-        first numbers in the flat memory of all registers.
+        The force program reads its inputs from registers, and writes its results there. A register
+        holds one number for each of the `states`, so that register k begins at the offset
+        k * `states` in the flat memory of all registers.
 
         Args:
             element: batch element.
             states: number of states that are evaluated in one call.
         """
         prepared, layout = element.program.prepare(states)
+        # `rows` has the first register of each kind of input and output.
         rows, flags, r = layout.rows, layout.flags, prepared.r
         r[rows[IN_P] : rows[IN_E]] = element.parameters[:, None]
         compute_constants, self._run_moment, self._run_impact = prepared.make_runners()

@@ -166,7 +166,8 @@ def integrate_velocity(
     if velocity and limit:
         acceleration = subtract_dry_friction(velocity, force, limit) * inverse
         final_velocity = velocity + acceleration * duration
-        # A product of both would underflow to zero for the remainder of a rounding error.
+        # The body keeps its direction: it does not stop. The sign of a product is not tested,
+        # because the product of two tiny velocities may underflow to zero.
         if (final_velocity < 0) == (velocity < 0):
             return final_velocity
         # The body stops at the time -velocity / acceleration; the remaining time begins there.
@@ -176,11 +177,17 @@ def integrate_velocity(
 
 
 def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
-    """Integrate one batch element, a body on a hinge or guide, by equations (1) to (4).
+    """Integrate one batch element, a body on a hinge or guide, at second order in the step.
 
-    The engine's velocity w belongs to the time half a step before the position. Each step begins
-    with half a step of the velocity (1), which is applied as one force (4); the engine moves the
-    joint (2); the second half of the velocity is implicit in the damping (3).
+    The engine's velocity w belongs to the time half a step before the position. With the inertia M
+    and all forces f, each step of length h is
+
+        start:  w  = v + h/2 f(t, x, v) / M       (1)
+        engine: x' = x + h w                      (2)
+        end:    v' = w + h/2 f(t', x', v') / M    (3)
+
+    where the engine reaches w (1) by the force (w - w_before) M / h (4), and (3) is implicit in the
+    damping.
 
     Args:
         joint: the body of the engine.

@@ -234,8 +234,8 @@ def compute_damping_ratio(
 ) -> float:
     """Return the damping ratio of a spring and damper that only push, for a given restitution.
 
-    T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation
-    20.
+    The restitution of such a contact is known (T. Schwager, T. Poeschel, Granular Matter 9, 465,
+    2007, doi:10.1007/s10035-007-0065-z, equation 20); it is inverted by bisection.
 
     Args:
         restitution: restitution of an impact.
@@ -251,7 +251,11 @@ def compute_damping_ratio(
 
 
 def _compute_restitution(ratio: float) -> float:
-    """Return the restitution of a spring and damper that only push, with this damping ratio."""
+    """Return the restitution of a spring and damper that only push, with this damping ratio.
+
+    Equation 20 of Schwager and Poeschel (2007), for strong damping (a ratio of at least 1) and weak
+    damping; at a ratio of 1, it is the limit exp(-2) of both.
+    """
     if ratio >= 1.0:
         root = math.sqrt(ratio * ratio - 1.0)
         return math.exp(-2.0 * ratio * math.acosh(ratio) / root) if root else math.exp(-2.0)

@@ -115,6 +115,12 @@ class MujocoEngine:
         bounces gets impacts at their exact times, and any other system is a body on a
         joint.
 
+        Args:
+            system: System that the engine will integrate.
+            largest_step: Longest step, s.
+            stiffness: Stiffness of the soft contact, 1/s^2; None for exact impacts.
+            threads: Number of threads.
+
         Raises:
             InputError: MuJoCo cannot simulate the system.
         """
