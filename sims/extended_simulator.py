@@ -126,8 +126,10 @@ class ExtendedSimulator:
         effects: Coefficients by effect, in the order in which a signal passes the effects.
         constants: Constants stated by the recording, and fitted ones.
         observe: Channels of the recording.
-        kind: Simulator class of the system, if it is known, as after `open_extended` and explain.
-        robot: Model file and additions to it, if the system is a robot.
+        kind: Simulator class of the system without effects, if it is known, as after
+            `open_extended` and explain.
+        robot: What the file states about a robot: its model file and additions to it; None for
+            other systems. (`kind.robot` is the robot itself, as read from that file.)
     """
 
     name: str
@@ -190,6 +192,7 @@ def format_extended(extended: ExtendedSimulator, folder: Path | None = None) -> 
     """
     import tomli_w
 
+    # The base simulator: a registered system, or a robot's model file.
     if extended.robot is None:
         base_entries = {"system": extended.system, **_get_engine_setting(extended)}
     else:
@@ -321,11 +324,12 @@ def make_simulator_class(
 ) -> type[SystemSimulator]:
     """Make the extended simulator as a class that can be registered.
 
-    An instance made without arguments is the fitted simulator.
+    An instance made without arguments is the fitted simulator: its parameters are those of the
+    system and the coefficients of the effects, with the fitted values as nominal ones.
 
     Args:
         extended: Content of the file.
-        kind: Simulator class of the system.
+        kind: Simulator class of the system without effects.
 
     Raises:
         InputError: A parameter, effect, coefficient, constant or channel does not exist.
@@ -341,6 +345,7 @@ def make_simulator_class(
     effects, observed = list(extended.effects), list(extended.observe)
     settings = _get_engine_setting(extended)
     extended_simulator = kind(extended.constants, observed, effects=effects, **settings)
+    # The parameters of the effects follow those of the system.
     effect_parameters = extended_simulator.parameters[len(base_parameters) :]
     added_parameters = [
         _set_nominal(p, number) for p, number in zip(effect_parameters, coefficients, strict=True)
@@ -400,7 +405,7 @@ def _make_subclass(
         # numbers distinguishes them; otherwise a tuner trained in one would count as trained in
         # another.
         "source_digest": hashlib.sha256(format_extended(extended).encode()).hexdigest(),
-        # An effect at a place of a robot is derived from the registered effect.
+        # The registered effects: an effect at a place of a robot is named EFFECT@PLACE.
         "made_of": tuple(library.get_effect(name.partition("@")[0]) for name in effects),
     }
     simulator: type[SystemSimulator] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
@@ -458,8 +463,11 @@ def _list_coefficients(
 def _set_nominal(parameter: Parameter, number: FittedValue) -> Parameter:
     """Set the nominal value of a parameter to a fitted number, with a training range around it.
 
-    The half width of the range is the larger of two: a share of the number, and a multiple of the
-    half width of its 95 % interval, if it has one.
+    Learned tuners are trained in this range. Its half width is the larger of two: a share of the
+    number, and a multiple of the half width of its 95 % interval, if it has one.
+
+    Returns:
+        The parameter with the number as nominal value, and bounds that include it.
     """
     reach = max(MIN_TRAINING_RANGE_SHARE * abs(number.value), _MIN_HALF_WIDTH)
     if number.low is not None and number.high is not None:
@@ -468,7 +476,7 @@ def _set_nominal(parameter: Parameter, number: FittedValue) -> Parameter:
     # The fitted value may be outside the plausible range; extend the bounds to include it.
     low, high = min(low, number.value), max(high, number.value)
     training_range = (max(low, number.value - reach), min(high, number.value + reach))
-    # Bounds on both sides of the number may leave no range.
+    # Bounds on both sides of the number may leave no range; then the bounds are used (None).
     training = training_range if training_range[0] < training_range[1] else None
     return replace(parameter, nominal=number.value, bounds=(low, high), training=training)
 

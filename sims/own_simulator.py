@@ -167,6 +167,7 @@ class OwnSimulator(SystemSimulator):
         `says`.
         """
         _check_declaration(cls)
+        # States that are positions or velocities.
         motion_states = {*cls.coordinates, *cls.rates}
         # Engines pass two vectors of states only, positions and rates: others follow the rates.
         other_states = [name for name in cls.states if name not in motion_states]

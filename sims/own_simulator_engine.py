@@ -80,9 +80,13 @@ class OwnSimulatorEngine:
         """Return readings (L, R, C) of all channels, in place of positions and their derivatives.
 
         There is one row before the first step, and one after each `batch.steps_per_sample` steps.
-        An element with a number that is not finite is all NaN.
+        An element with a number that is not finite is all NaN. Positions, velocities and
+        accelerations are the same array: the system reads only the first.
 
-        Shapes: L batch elements, C channels.
+        Shapes: L batch elements, R rows, C channels.
+
+        Args:
+            batch: Batch of the system that was made from the user's class.
 
         Raises:
             InputError: A method of the simulator raised an exception or returned a wrong value.
@@ -105,8 +109,8 @@ class OwnSimulatorEngine:
     def _run(self, batch: IntegrationBatch) -> Array | None:
         """Simulate one batch element with the user's simulator.
 
-        Before each step the forces of effects are applied, and after it levels are cut at their
-        rims.
+        Before each step the forces of effects are applied. After it, effects limit the levels, such
+        as that of a tank, which overflows at its rim.
 
         Args:
             batch: Batch of this element alone.

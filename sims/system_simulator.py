@@ -84,6 +84,7 @@ class SystemSimulator(Simulator):
             settings: Settings of the engine, e.g. ``time_step``.
         """
         super().__init__(constants, observe)
+        # Instance of the system; names and units are read from its class, `self.system`.
         self._declared = self.system()
         self._stored_steps: dict[tuple[object, ...], _StepsAndInputs] = {}
         self.engine = self._make_engine(engine, settings)
@@ -285,6 +286,7 @@ class SystemSimulator(Simulator):
             return compute(runs, acting)
         stored = self._stored_steps.get(runs.contents)
         if stored is None:
+            # One row for each distinct scenario; without effects, as none of them acts here.
             grid, _ = stored = compute(runs.one_each, ())
             if len(self._stored_steps) >= MAX_STORED_TIME_GRIDS:  # the oldest makes room
                 del self._stored_steps[next(iter(self._stored_steps))]
@@ -355,6 +357,9 @@ class SystemSimulator(Simulator):
     ) -> Array:
         """Return the sensor readings of a simulation, after the sensor effects.
 
+        A gain or a bias changes one channel, the first observed one of the system's `sensed`. A
+        filter changes all channels, and needs the state after every step of the integration.
+
         Shapes: L batch elements, T samples, C channels.
 
         Args:
@@ -369,11 +374,11 @@ class SystemSimulator(Simulator):
         """
         channels = self._declared.observe(motion.x, motion.v, motion.a, batch.constants)
         names = [c.name for c in self.channels]
-        # A gain or bias affects one channel only, a filter all of them.
         affected_name = self.system.reading(names)
         times = grid.compute_state_times(batch.steps_per_sample)
         steps = np.diff(times, axis=1, prepend=0.0)
-        # Numbers of the samples' states: with a filter, more states than the samples are stored.
+        # (L, T) numbers of the stored states at the samples. With a filter, a state is stored after
+        # every step, so that the numbers of the grid are multiplied by the steps per sample.
         sample_rows = grid.rows * (grid.steps_per_sample // batch.steps_per_sample)
         observations = np.empty((*sample_rows.shape, len(names)))
         for column, name in enumerate(names):

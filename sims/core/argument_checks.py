@@ -150,7 +150,7 @@ def _bind_arguments(
     args: Sequence[object],
     kwargs: Mapping[str, object],
 ) -> inspect.BoundArguments:
-    """Return the arguments of a call by name, with errors that a user understands.
+    """Return the arguments of a call by name, not yet checked, with errors that a user understands.
 
     Python's own TypeError names neither the expected type nor a similar name.
 
@@ -174,6 +174,7 @@ def _bind_arguments(
         # A required argument is missing: say what is expected for it.
         for name, parameter in signature.parameters.items():
             required = parameter.default is parameter.empty
+            # Python's message: missing 1 required positional argument: 'NAME'
             if required and "missing" in str(error) and f"'{name}'" in str(error):
                 expected = _describe_type(hints[name])
                 raise InputError(
@@ -202,7 +203,7 @@ def _convert_value(place: str, value: Any, hint: Any) -> Any:
         return _convert_annotated(place, value, hint)
     if origin in (Union, UnionType):
         return _convert_to_union(place, value, hint)
-    # A generic type such as Sequence[str]; ``type[Effect]`` is treated as a single type.
+    # Each generic type, such as Sequence[str], has a converter; ``type[Effect]`` is a single type.
     if origin is not None and origin is not type:
         converted = _CONVERTERS[origin](place, value, hint)
     elif hint is Any:
@@ -306,12 +307,18 @@ def _convert_to_list(place: str, value: Any, hint: Any) -> Any:
 
     Args:
         place: the argument and the position in it, for messages.
-        value: value of the argument; a text is split at commas.
+        value: value of the argument; a text is split at commas, unless it is a path.
         hint: annotation, a list type.
+
+    Returns:
+        The list of converted entries; `_NO_MATCH` if the value is no list, or no valid text.
+
+    Raises:
+        _MismatchError: an entry of the list has a wrong type.
     """
     (element_hint,) = get_args(hint)
     if isinstance(value, str):
-        # Paths may contain commas, names may not.
+        # Paths may contain commas, names may not. A path is annotated as text or `Path`.
         is_path = get_origin(element_hint) in (Union, UnionType) and Path in get_args(element_hint)
         parts = [value] if is_path else [part.strip() for part in value.split(",")]
     elif isinstance(value, Iterable) and not isinstance(value, Mapping | bytes):
@@ -344,7 +351,7 @@ def _is_convertible(value: Any, hint: Any) -> bool:
 
 
 def _convert_to_dict(place: str, value: Any, hint: Any) -> Any:
-    """Convert a value to a dict with texts as keys.
+    """Convert a value to a dict with texts as keys; return `_NO_MATCH` for another value.
 
     Args:
         place: the argument and the position in it, for messages.
@@ -360,7 +367,7 @@ def _convert_to_dict(place: str, value: Any, hint: Any) -> Any:
 
 
 def _convert_to_tuple(place: str, value: Any, hint: Any) -> Any:
-    """Convert a value to a tuple of the annotated length.
+    """Convert a value to a tuple of the annotated length; return `_NO_MATCH` for another value.
 
     Args:
         place: the argument and the position in it, for messages.

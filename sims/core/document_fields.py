@@ -65,13 +65,14 @@ def _restore(kind: Any, value: Any) -> Any:
     if is_dataclass(kind):
         return _restore_dataclass(kind, value)
     origin, parts = get_origin(kind), get_args(kind)
-    if origin in (Union, UnionType):  # one type, or None
+    if origin in (Union, UnionType):  # one type or None; the value is not None here
         return _restore(next(part for part in parts if part is not NoneType), value)
     if origin is tuple:  # of any length, with entries of one type
         return tuple(_restore(parts[0], part) for part in value)
     if origin in (dict, Mapping):
         _, value_kind = parts
         return {key: _restore(value_kind, part) for key, part in value.items()}
+    # A plain tuple has an origin, which is treated above.
     is_named_tuple = isinstance(kind, type) and issubclass(kind, tuple)
     return kind(*value) if is_named_tuple else value
 

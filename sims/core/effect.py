@@ -80,8 +80,9 @@ class Coefficient:
     def unit_on(self, system: System | type[System], observed: Sequence[str] = ()) -> str | None:
         """Return the unit on this system; None if the effect does not exist there.
 
-        If `of` names the input or the reading, its unit replaces that word: ``input/s`` becomes
-        ``N/s`` for a force as input.
+        If `of` names the input or the reading (the channel on which sensor effects act), its unit
+        replaces that word: ``input/s`` becomes ``N/s`` for a force as input. An ``error`` of a
+        servo has the unit of its input, the set point.
 
         Args:
             system: System on which the effect acts.
@@ -535,6 +536,8 @@ def make_effect_parameters(
     effect: Effect | type[Effect], system: type[System], observed: Sequence[str] = ()
 ) -> tuple[Parameter, ...]:
     """Return the coefficients of an effect as parameters with their plausible ranges as bounds.
+
+    A parameter is called ``EFFECT.COEFFICIENT``, or ``EFFECT`` if there is only one coefficient.
 
     Args:
         effect: Effect.

@@ -22,6 +22,7 @@ def set_glfw_library() -> None:
     package = find_spec("glfw")
     if package is None or package.origin is None:
         return
+    # The package of glfw has one library for Wayland and one for X11; glfw chooses in this way.
     session = os.environ.get("PYGLFW_LIBRARY_VARIANT") or os.environ.get("XDG_SESSION_TYPE", "")
     variant = "wayland" if session.lower() == "wayland" else "x11"
     library = Path(package.origin).parent / variant / "libglfw.so"

@@ -203,6 +203,9 @@ class Registry(Generic[T]):
     def announce(self, part: type[T], path: Path | None) -> None:
         """Register a stub for a class whose code is not loaded into this process.
 
+        The code of a plugin runs in isolation, in another process. The stub stands for its class
+        here: it has the name and the declared attributes, but none of the code.
+
         Args:
             part: Stub class with the known attributes.
             path: Plugin file of the class; None for a class of an installed package, which is
@@ -214,7 +217,8 @@ class Registry(Generic[T]):
         source = f"plugin {path}: " if path else ""
         name = _name_of(part, source)
         existing = self._stubs.get(name) or self._added.get(name)
-        # A stub may be announced again for the same file.
+        # A stub may be announced again for the same file. For a class of an installed package
+        # (without a path), the stub takes precedence over the entry point of that name.
         is_taken = existing is not None and existing.path != path
         if is_taken or (path is not None and name in self._entry_points):
             raise InputError(f"{source}{self.kind} '{name}' exists already; give it another name")

@@ -27,7 +27,7 @@ def compute_yaw_pitch_roll(quaternions: Array, reference: Array) -> Array:
     # The inverse of a unit quaternion is its conjugate.
     inverse_reference = reference * np.array([1.0, -1.0, -1.0, -1.0])
     w, x, y, z = multiply_quaternions(quaternions, inverse_reference[None]).T
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # NaN where a sample is missing
         angles = [
             np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
             np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)),

@@ -115,6 +115,8 @@ class StateSnapshot:
     def aimed(self, shift: Array) -> Array:
         """Return the change of the drive's force (L, D) if the servo's set point is shifted.
 
+        Effects inside a servo, such as its dead band, are expressed as such a shift.
+
         Shapes: L batch elements, D coordinates.
 
         Args:
