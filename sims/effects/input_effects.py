@@ -107,7 +107,7 @@ class InputHold(Input):
     )
     source = "K. J. Astrom, B. Wittenmark, Computer-Controlled Systems (1997), chapter 7"
     coefficients = (Coefficient("coefficient", _DIMENSIONLESS, ((0, 1), (0, 1), (0, 1)), most=1.5),)
-    between = True  # (0), applied where means over steps are computed: `sims.engines.time_grid`
+    between = True  # (0), applied where means over steps are computed: `sims.engines.step_inputs`
 
 
 class InputGain(Input):
@@ -335,13 +335,13 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
         lag: (L, 1) time constants in seconds.
     """
     # For a constant command, w(end) = decay w(start) + (1 - decay) u.
-    decay, mean = compute_lag_response(signal.steps, lag)
+    decay, mean_weight = compute_lag_response(signal.steps, lag)
     additions = (1.0 - decay) * signal.values
     step_end_values = run_recursion(LINEAR, decay, additions, signal.start)
-    # Engines hold the input over a step. The mean of w, u + (w(start) - u) m, transfers the same
-    # momentum as the lagged input.
+    # Engines hold the input over a step. The mean of w, u + (w(start) - u) mean_weight, transfers
+    # the same momentum as the lagged input.
     step_start_values = shift_by_one_step(step_end_values, signal.start)
-    return signal.values + (step_start_values - signal.values) * mean
+    return signal.values + (step_start_values - signal.values) * mean_weight
 
 
 def _apply_play(signal: Signal, half_width: Array) -> Array:
@@ -377,7 +377,8 @@ def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
     max_changes = np.where(has_length, limit * np.where(has_length, signal.steps, 1.0), 0.0)
     step_end_values = run_recursion(RATE_LIMIT, signal.values, max_changes, signal.start)
     changes = step_end_values - shift_by_one_step(step_end_values, signal.start)
-    # w changes linearly until it reaches the command, and is constant for the rest of the step.
+    # w changes linearly until it reaches the command, and is constant for the rest of the step. Its
+    # mean is below the end value by half the change, over the share of the step in which it moves.
     moving_share = np.abs(changes) / np.where(max_changes > 0, max_changes, np.inf)
     mean_values = step_end_values - 0.5 * moving_share * changes
     return np.where(np.isfinite(max_changes), mean_values, signal.values)

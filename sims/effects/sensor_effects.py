@@ -263,10 +263,10 @@ def _apply_lag(signal: Signal, lag: Array) -> Array:
 
     Shapes: L batch elements, S steps.
     """
-    decay, mean = compute_lag_response(signal.steps, lag)
+    decay, mean_weight = compute_lag_response(signal.steps, lag)
     old = shift_by_one_step(signal.values, signal.start)
     # A signal that goes from `old` to `values` in a step gives r(end) = decay r(start) + increment.
-    increments = signal.values - decay * old - mean * (signal.values - old)
+    increments = signal.values - decay * old - mean_weight * (signal.values - old)
     return run_recursion(LINEAR, decay, increments, signal.start)
 
 

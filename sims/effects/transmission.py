@@ -171,7 +171,8 @@ class DrivenLoad(HiddenStateEffect):
     def compute_static_deflection(self, c: Array, fall: Array) -> Array:
         """Return the static deflection (L, 1) of the load under an acceleration of gravity.
 
-        By default it is zero; NaN stays NaN.
+        By default it is zero, as for backlash, where the load begins in the middle of the gap; NaN
+        stays NaN.
 
         Args:
             c: (K, L, 1) coefficients.
@@ -200,7 +201,7 @@ class JointFlexibility(DrivenLoad):
     between = _SERIES_SPRING_COEFFICIENTS
 
     def compute_static_deflection(self, c: Array, fall: Array) -> Array:
-        """Return the static deflection (L, 1) of the spring.
+        """Return the static deflection (L, 1) of the spring under the load's weight, fall / w^2.
 
         Args:
             c: (3, L, 1) coefficients: share s, frequency w (rad/s) and damping ratio z.
@@ -245,10 +246,11 @@ class JointBacklash(DrivenLoad):
     def compute_coupling_force(self, c: Array, moment: StateSnapshot, state: HiddenState) -> Array:
         """Return the force of the flanks per unit of load inertia, T / (s M), (L, 1).
 
-        T = s (1 - s) M (k^2 d + 4 k (x' - y') |d| / (|d| + depth)) (4), with d the excess of x - y
-        over the half gap to either side, the inertia M, the share s of the load, and the contact's
-        frequency k. Damping increases with the penetration |d|, so that the force is continuous.
-        Flanks push and never pull.
+        T = s (1 - s) M (k^2 d + 4 k (x' - y') |d| / (|d| + depth)) (4), with the position x of the
+        drive and y of the load, the excess d of x - y over the half gap to either side, the inertia
+        M, the share s of the load, the contact's frequency k, and a depth of 1 % of the gap.
+        Damping increases with the penetration |d|, so that the force is continuous. Flanks push and
+        never pull.
 
         Args:
             c: (2, L, 1) coefficients: gap and share s.
@@ -257,10 +259,13 @@ class JointBacklash(DrivenLoad):
         """
         relative_position = moment.primary - state.x
         indentation = relative_position - np.clip(relative_position, -0.5 * c[0], 0.5 * c[0])
-        pressed = np.abs(indentation) / (np.abs(indentation) + CONTACT_DAMPING_DEPTH * c[0])
-        push = CONTACT_FREQUENCY * indentation + 4.0 * pressed * (moment.v[:, :1] - state.v)
-        pull = (1.0 - self.behind(c)) * CONTACT_FREQUENCY * push  # (4)
-        return np.where(indentation > 0, np.maximum(pull, 0.0), np.minimum(pull, 0.0))
+        # Share of the full damping that acts at this penetration.
+        damping_share = np.abs(indentation) / (np.abs(indentation) + CONTACT_DAMPING_DEPTH * c[0])
+        relative_velocity = moment.v[:, :1] - state.v
+        push = CONTACT_FREQUENCY * indentation + 4.0 * damping_share * relative_velocity
+        force = (1.0 - self.behind(c)) * CONTACT_FREQUENCY * push  # (4)
+        # A force against the penetration would pull.
+        return np.where(indentation > 0, np.maximum(force, 0.0), np.minimum(force, 0.0))
 
 
 def _compute_gravity_acceleration(moment: StateSnapshot, y: Array) -> Array:

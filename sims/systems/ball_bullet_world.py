@@ -52,6 +52,7 @@ def build(client: int, constants: Mapping[str, float]) -> int:
         contactERP=0.0, contactSlop=0.0, restitutionVelocityThreshold=0.0, physicsClientId=client
     )
     # The contact uses the product of both bodies' values: with 1 for the ground, the ball's own.
+    # -1 is Bullet's index of a body's base.
     pybullet.changeDynamics(
         ground, -1, restitution=1.0, lateralFriction=1.0, physicsClientId=client
     )
@@ -82,6 +83,7 @@ def build_native(client: int, constants: Mapping[str, float], settings: Mapping[
     pybullet = bullet_world.import_pybullet()
     ground, ball = _create_ground_and_ball(client, constants)
     friction = settings["lateral_friction"]
+    # -1 is Bullet's index of a body's base.
     pybullet.changeDynamics(
         ground,
         -1,

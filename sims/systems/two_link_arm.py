@@ -41,7 +41,13 @@ _FRICTION_SUBSTEPS = 16
 """Parts of a step in which dry friction changes sides."""
 _SOLVER_ROUNDS = 200
 """Rounds of Bullet's constraint solver, in which both joints' frictions are settled together."""
-_UNPICKLABLE_ATTRIBUTES = ("_world", "_place", "_push", "_state", "_go")
+_UNPICKLABLE_ATTRIBUTES = (
+    "_world",
+    "_set_joint_state",
+    "_set_joint_motor",
+    "_get_joint_state",
+    "_step_simulation",
+)
 """Attributes that belong to a world in this process and cannot be copied."""
 _REST_SPEED = 1e-6
 """rad/s: a joint that is slower is at rest."""
@@ -164,13 +170,13 @@ class TwoLinkArm(OwnSimulator):
                 self._arm, joint, localInertiaDiagonal=(inertia,) * 3, jointDamping=damping
             )
         self._friction = [theta["friction1"], theta["friction2"]]
-        self._step = 0.0
+        self._step = 0.0  # s; Bullet's step is set before the first one
         # Functions of Bullet, looked up once: a run calls each of them thousands of times.
-        self._place = pybullet.resetJointState
-        self._push = pybullet.setJointMotorControl2
-        self._state = pybullet.getJointState
-        self._go = pybullet.stepSimulation
-        self._torque = pybullet.TORQUE_CONTROL
+        self._set_joint_state = pybullet.resetJointState
+        self._set_joint_motor = pybullet.setJointMotorControl2
+        self._get_joint_state = pybullet.getJointState
+        self._step_simulation = pybullet.stepSimulation
+        self._torque_mode = pybullet.TORQUE_CONTROL
         self._q = [initial["q1"], initial["q2"]]
         self._v = [initial["qd1"], initial["qd2"]]
 
@@ -197,7 +203,8 @@ class TwoLinkArm(OwnSimulator):
             linkJointTypes=[pybullet.JOINT_REVOLUTE, pybullet.JOINT_REVOLUTE],
             linkJointAxis=[_JOINT_AXIS, _JOINT_AXIS],
         )
-        # By default Bullet adds air resistance, sleep when nothing moves, and a speed limit.
+        # By default Bullet adds air resistance, sleep when nothing moves, and a speed limit. -1 is
+        # Bullet's index of the body's base.
         pybullet.changeDynamics(
             arm, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=NO_LIMIT
         )
@@ -223,8 +230,8 @@ class TwoLinkArm(OwnSimulator):
     def _step_heun(self, torques: tuple[float, float], seconds: float) -> bool:
         """Make one step of Heun's method from two steps of Bullet, v to v1 and v1 to v2.
 
-        The result is q + h (v + v1) / 2 (2) and (v + v2) / 2 (3). Bullet's step is of first order;
-        these means are of second order.
+        With the angles q, the rates v and the step h, the result is q + h (v + v1) / 2 (2) and
+        (v + v2) / 2 (3). Bullet's step is of first order; these means are of second order.
 
         Args:
             torques: torques at both joints, N·m.
@@ -237,7 +244,7 @@ class TwoLinkArm(OwnSimulator):
         q = self._q
         v = self._v
         for joint in (0, 1):
-            self._place(self._arm, joint, q[joint], v[joint])
+            self._set_joint_state(self._arm, joint, q[joint], v[joint])
         v1 = self._advance(torques)
         v2 = self._advance(torques)
         self._q = [q[i] + seconds * (v[i] + v1[i]) / 2 for i in (0, 1)]  # (2)
@@ -282,10 +289,10 @@ class TwoLinkArm(OwnSimulator):
         """Advance Bullet by one step with torques in N m; return the new joint rates in rad/s."""
         for joint in (0, 1):
             if torques[joint]:  # Bullet forgets them after each step
-                self._push(self._arm, joint, self._torque, force=torques[joint])
-        self._go()
-        _, rate1, *_ = self._state(self._arm, 0)
-        _, rate2, *_ = self._state(self._arm, 1)
+                self._set_joint_motor(self._arm, joint, self._torque_mode, force=torques[joint])
+        self._step_simulation()
+        _, rate1, *_ = self._get_joint_state(self._arm, 0)
+        _, rate2, *_ = self._get_joint_state(self._arm, 1)
         return rate1, rate2
 
 
@@ -294,9 +301,10 @@ def _has_stopped_or_turned(rate_before: float, middle: float, rate_after: float)
 
     Args:
         rate_before: rate at the beginning of the step, rad/s.
-        middle: rate in its middle.
-        rate_after: rate at its end.
+        middle: rate after the first of two steps of Bullet.
+        rate_after: rate after the second one.
     """
     if abs(rate_before) <= _REST_SPEED:
         return False
+    # Rates times the sign of the rate before are negative after a reversal.
     return min(middle * rate_before, rate_after * rate_before) < _REST_SPEED * abs(rate_before)

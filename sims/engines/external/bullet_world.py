@@ -132,7 +132,7 @@ def build_jointed_body(kind: str, client: int, constants: Mapping[str, float]) -
         physicsClientId=client,
     )
     # By default Bullet adds air resistance, sleeping, a speed limit of 100, and a motor that brakes
-    # the joint.
+    # the joint. -1 is Bullet's index of the body's fixed base, 0 that of its only joint.
     pybullet.changeDynamics(
         body,
         -1,
