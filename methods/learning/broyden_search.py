@@ -99,10 +99,16 @@ class BroydenSearch:
     def _compute_step(self, residual: Array) -> Array:
         """Compute Broyden's step from the best point, at most twice as long as Algorithm 1's.
 
-        If it points against the estimate, Algorithm 1's step is used. After the first setback the
-        updated slope is enough; after each further one the step is halved.
+        It is s = -B^-1 h (1), with the slope B of the network's estimate h; B = -1 at first. The
+        step of TuneNet's Algorithm 1 is h itself; it is used if s points against h. After the first
+        setback (a point that was not better) the updated slope is enough; after each further one
+        the step is halved.
 
-        It is s = -B^-1 h (1), with the slope B of the network's estimate h; B = -1 at first.
+        Args:
+            residual: (dim,) estimate h at the best point, the difference to the target.
+
+        Returns:
+            (dim,) step in the unit cube.
         """
         try:
             step = np.linalg.solve(self._slope, -residual)  # (1)

@@ -72,10 +72,11 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
 
 
 def _fit_camera_line(design_matrix: Array, values: Array) -> Array:
-    """Fit a, b and c of y = a + b x - c x y robustly; a camera maps heights x to pixel rows y so.
+    """Fit a, b and c of y = a + b x - c x y robustly, the map of heights x to pixel rows y.
 
-    The method is iteratively reweighted least squares with Cauchy's weights, so that a few wrong
-    samples do not spoil the fit.
+    It is the map y = (a + b x) / (1 + c x) of a camera, multiplied by its denominator. The method
+    is iteratively reweighted least squares with Cauchy's weights, so that a few wrong samples do
+    not spoil the fit.
 
     Args:
         design_matrix: (n, 3) regressors 1, x and -x y of n samples.

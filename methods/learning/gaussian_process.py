@@ -69,12 +69,13 @@ class GaussianProcess:
         self.points = points
         self.values = values
         self.settings = settings
-        self._squares = (points[:, None] - points) ** 2
+        self._squares = (points[:, None] - points) ** 2  # (n, n, dim) for all pairs of points
         dim = points.shape[1]
         length, length_width = settings.length
         noise, noise_width = settings.noise
         lengths = np.full(dim, length)
         widths = np.full(dim, length_width)
+        # Means and standard deviations of the priors, of the logarithms of lengths and noise.
         self._centre = np.log(np.append(lengths, noise))
         self._width = np.append(widths, noise_width)
         self.hyper = self._centre if hyper is None else hyper
@@ -82,6 +83,8 @@ class GaussianProcess:
         if fit and len(points) > 2 and np.ptp(values) > 0.0:
             self.hyper = self._maximise_posterior()
         k, _ = self._compute_correlation(self._squares)
+        # Cholesky factor of K, the correlation with noise on its diagonal; alpha is
+        # K^-1 (values - mean).
         self._lower = _compute_cholesky_factor(k, float(np.exp(self.hyper[-1])))
         self.mean, self.variance, self._alpha = _compute_mean_and_variance(self._lower, values)
 
@@ -146,8 +149,13 @@ class GaussianProcess:
     def _compute_negative_evidence(self, hyper: Array) -> tuple[float, Array]:
         """Compute the negative log marginal likelihood and its gradient (dim + 1,).
 
-        These are (2.30) and (5.9) of Rasmussen and Williams. Constant terms are left out, and mean
-        and variance have their most likely values for the given `hyper` (dim + 1,).
+        With K the correlation of the n values with noise and v their most likely variance, it is
+        n / 2 log v + log |K| / 2, which is (2.30) of Rasmussen and Williams without constant terms.
+        Its derivative by K is (K^-1 - alpha alpha^T / v) / 2 (5.9), with alpha = K^-1 (values -
+        mean).
+
+        Args:
+            hyper: (dim + 1,) logarithms of the length scales and of the noise.
         """
         from scipy.linalg import cho_solve
 

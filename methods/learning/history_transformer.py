@@ -132,10 +132,11 @@ def predict_proposals(
 ) -> Any:
     """Compute the proposals before and after each simulation of a history.
 
-    Each simulation becomes a token: direction and size of its difference from the target, its
-    parameters, the target, and the step from the simulation before (3). The network embeds the
-    tokens (4). Its output for a token is a matrix by which the difference is multiplied to give the
-    step to the next proposal (5), or as published the next proposal itself.
+    Each simulation becomes a token: direction u and size s of its difference from the target, its
+    parameters e, the target, and the step from the simulation before (3). The first token is that
+    of the target alone. Blocks of attention turn the tokens into outputs h (4). From these, the
+    next proposal is e + s (A(h) u + c(h)) (5), with a matrix A and a vector c that are linear in h;
+    as published, it is itself linear in h.
 
     The code is shared by numpy and torch, whose functions have the same names.
 
@@ -176,6 +177,7 @@ def predict_proposals(
     guess = _apply_linear_layer(w, "guess", h[..., :1, :])
     next_proposals = _apply_linear_layer(w, "next", h[..., 1:, :])
     if not design.published:
+        # For each parameter a row of the matrix A, then its entry of c.
         gain = next_proposals.reshape(*tried.shape, unit.shape[-1] + 1)
         direction_sum = (gain[..., :-1] * unit[..., None, :]).sum(axis=-1)
         next_proposals = tried + size * (direction_sum + gain[..., -1])  # (5)
@@ -361,10 +363,12 @@ def train_history_transformer(
     import torch
 
     def get_gain(name: str) -> float:
+        """Return the factor of the initial weights of an array; biases begin at zero."""
         gain = INITIAL_WEIGHT_LIMIT if name.endswith("weight") else 0.0
         return gain * _RESIDUAL_WEIGHT_FACTOR if name.startswith(_RESIDUAL_LAYERS) else gain
 
     def fit(weights: Weights, _: object) -> None:
+        """Minimise the loss; the weights are changed in place, and torch's generator is unused."""
         tensors = material.to_tensors()
         monitor = None
         if watched is not None:
@@ -402,8 +406,9 @@ def _compute_loss(
 ) -> Any:
     """Compute the mean squared error of the proposals: loss (8), or (9) if published.
 
-    (8) compares each proposal with the target's parameters, relative to the distance of the
-    simulation before; (9) compares it with the next point of the history.
+    (8) compares each proposal with the target's parameters. Each squared error after a simulation
+    is divided by the squared distance of that simulation from the target, plus `design.relative`^2.
+    (9) compares each proposal with the next point of the history.
 
     Args:
         w: weights by name.

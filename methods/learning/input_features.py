@@ -85,8 +85,13 @@ class InputFeatures:
     def fit(cls, data: TrainingData, reading: FeatureConfig) -> InputFeatures:
         """Choose the inputs from training data: samples that follow the parameters.
 
-        If scenarios differ, numbers that describe them are added; if their inputs differ, these
-        replace the samples. As published (`reading.raw`) all resampled samples are inputs.
+        If scenarios differ, numbers that describe them are added; if their input signals differ,
+        these numbers replace the samples. As published (`reading.raw`) all resampled samples are
+        inputs.
+
+        Args:
+            data: training simulations.
+            reading: configuration of the inputs.
         """
         data = data._replace(observations=reading.select_channels(data.observations))
         if reading.raw:

@@ -92,7 +92,7 @@ def minimise_loss(
     Args:
         optimiser: torch's optimiser of the weights.
         rates: learning rate of each epoch.
-        epochs: number of epochs.
+        epochs: number of epochs, for the monitor.
         draw_batches: divides the training data into batches, for each epoch anew.
         compute_loss: computes the loss of a batch.
         monitor: gets the losses after each epoch; its `held_out` computes the held-out loss.

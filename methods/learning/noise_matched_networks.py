@@ -144,6 +144,7 @@ class NoiseMatchedNetworks(Generic[Learner]):
         )
 
         def noisy() -> Learner:
+            """Train the network for noisy targets, on the simulations with noise."""
             noise = reading.noise * spread
             return learn("noisy", data.with_noise(noise, rng), noise)
 
@@ -307,6 +308,7 @@ class NoiseMatchedTuner(Tuner, Generic[Learner]):
             simulator, rng, budget, scenarios, per_scenario, self.draw_points
         )
         held_out = None
+        # A watched training also reports the loss on simulations that are not trained on.
         if self.watch is not None:
             ground = self.watch.ground
             # Separate simulations and a separate random stream do not affect the training.

@@ -234,7 +234,8 @@ def make_weighted_features(
     # A stable sort chooses the same numbers on every machine if weights are equal.
     order = np.argsort(-np.maximum(parameter_weight, scenario_weight), kind="stable")
     chosen_numbers = np.sort(order[:max_inputs])
-    # The deviation that a weight refers to: within scenarios, or in all of the data.
+    # A number's factor is its weight per unit of its deviation, so that the inputs are comparable:
+    # the deviation within scenarios for the parameters, in all of the data for the scenario.
     by_parameters = _compute_weight_per_deviation(
         parameter_weight[chosen_numbers], spread[chosen_numbers]
     )

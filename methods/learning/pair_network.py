@@ -180,10 +180,12 @@ def train_pair_network(
     alone: bool = False,
     watched: TrainingMonitor[tuple[PairInputs, Array]] | None = None,
 ) -> dict[str, Array]:
-    """Train the weights by Eq. 1; equal generators give bit-identical weights.
+    """Train the weights; equal generators give bit-identical weights.
 
-    The method is Adam with a learning rate that falls along half a cosine, or as published plain
-    gradient descent with a rate that falls exponentially.
+    The loss is the mean of |h - d|^2, relative to |d|^2 unless published, plus a multiple of the
+    squared weights; h is the network's estimate of the difference d of the parameters of a pair of
+    simulations (Eq. 1 of the paper). The method is Adam with a learning rate that falls along half
+    a cosine, or as published plain gradient descent with a rate that falls exponentially.
 
     Args:
         rows: input rows of both sides.
@@ -200,11 +202,14 @@ def train_pair_network(
     import torch
 
     def get_gain(name: str) -> float:
+        """Return the factor of the initial weights of an array."""
+        # As published: torch's default, uniform in +- 1 / sqrt(inputs) for weights and biases.
         if not design.adam:
             return 1.0
         return INITIAL_WEIGHT_LIMIT if name.endswith("weight") else 0.0
 
     def fit(weights: Weights, generator: Any) -> None:
+        """Minimise the loss; the weights are changed in place."""
         proposed_rows, target_rows, y = _convert_to_tensors(rows, parameters)
         loss = _make_loss(design, weights, alone)
         monitor = None

@@ -51,10 +51,10 @@ With it, two collinear regressors, such as a constant input and 1, share a coeff
 def compute_response_coefficients(
     observations: Array, inputs: Array, lengths: tuple[int, ...]
 ) -> Array:
-    """Fit an equation of motion (1) to each run and channel, with time in samples.
+    """Fit an equation of motion to each run and channel, with time in samples.
 
-    The acceleration of a channel is fitted by a constant, and by position, its cube, a smoothed
-    sign of the velocity, velocity and inputs.
+    The acceleration of a channel is fitted by q'' = k0 + k1 q + k3 q^3 + kf sign(q') + ku u + kd q'
+    (1), with the terms of all channels q and inputs u, and a smoothed sign.
 
     Args:
         observations: (n, T, C) observations with the runs concatenated along T; NaN for missing
@@ -83,8 +83,11 @@ def compute_response_coefficients(
 def _compute_run_response(series: Array, inputs: Array) -> Array:
     """Compute the coefficients (n, C * R) of one run from series (n, T, C) and inputs (T, U).
 
-    Both sides of the equation of motion (1) are multiplied by a bump and integrated, at many places
-    of the run, which gives a linear regression on R terms for each of n observations.
+    Both sides of the equation of motion (1) of `compute_response_coefficients` are multiplied by a
+    bump w, which is zero at both ends, and integrated, at many places of the run. By parts, the
+    integral of w q'' is that of w'' q, and the integral of w q' is minus that of w' q (2), so that
+    no noisy signal is differentiated. The result is a linear regression on R terms for each of n
+    observations.
 
     Shapes: T samples, C channels, U inputs.
     """

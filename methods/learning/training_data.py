@@ -138,8 +138,9 @@ _FIXED_POINT_ITERATIONS = 60
 def generate_quasi_random_points(count: int, shift: Array) -> Array:
     """Return quasi-random points of the unit cube by the additive recurrence (2).
 
-    Point n is (s + n g^-k) mod 1 in dimension k, with the generalised golden ratio g. They fill the
-    cube more evenly than random points. A random shift gives another set of points.
+    Point n is (s + n g^-k) mod 1 in dimension k, with the generalised golden ratio g, the solution
+    of g^(d + 1) = g + 1 (1) in d dimensions. They fill the cube more evenly than random points. A
+    random shift gives another set of points.
 
     Args:
         count: number of points.
@@ -151,7 +152,7 @@ def generate_quasi_random_points(count: int, shift: Array) -> Array:
     dim = len(shift)
     ratio = 2.0
     for _ in range(_FIXED_POINT_ITERATIONS):
-        ratio = (1.0 + ratio) ** (1.0 / (dim + 1))  # (1)
+        ratio = (1.0 + ratio) ** (1.0 / (dim + 1))  # (1), solved for the power
     steps = ratio ** -np.arange(1.0, dim + 1)
     numbers = np.arange(1, count + 1)[:, None]
     points: Array = (shift + numbers * steps) % 1.0  # (2)

@@ -32,7 +32,8 @@ class MuJoCoSysId(Tuner):
             sysid = importlib.import_module("mujoco.sysid")  # it has no types
             cube = sysid.ParameterDict()
             cube.add(sysid.Parameter("cube", task.start, np.zeros(task.dim), np.ones(task.dim)))
-            # One group of residuals; the toolbox's predictions and data are not used.
+            # The toolbox asks for groups of residuals, predictions and data at points in columns.
+            # There is one group; predictions and data are not used.
             compute_groups = lambda x, _: ([residuals(x.reshape(task.dim, -1).T).T], None, None)  # noqa: E731
             sysid.optimize(cube, compute_groups, verbose=False, output=io.StringIO())
             return "mujoco.sysid reached its tolerance"

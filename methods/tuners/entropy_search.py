@@ -84,9 +84,10 @@ class EntropySearch(Tuner):
     def _tune_as_published(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
         """Search on a fixed grid, and stop when the estimate repeats (algorithm 1 of the paper).
 
-        After each simulation the error is modelled by a Gaussian process. The estimate is the grid
-        point that most often has the smallest error in draws of the process; the next simulation is
-        at the point with the largest entropy term (1).
+        After each simulation the error is modelled by a Gaussian process. P of a grid point is the
+        share of draws of the process in which it has the smallest error. The estimate is the grid
+        point with the largest P; the next simulation is at the point with the largest entropy term
+        -P log P (1).
 
         Args:
             task: start, observations, number of parameters and budget of the run.
@@ -123,7 +124,8 @@ class EntropySearch(Tuner):
         """Search with new candidates for every simulation, without stopping.
 
         The first points are quasi-random; then each simulation is at the candidate with the largest
-        entropy term (1), where it is most uncertain whether the error has its minimum.
+        entropy term -P log P (1), with P its probability to be the minimiser of the error: there it
+        is most uncertain whether the error has its minimum.
 
         Args:
             task: start, observations, number of parameters and budget of the run.

@@ -55,7 +55,6 @@ class TuneNetLeastSquares(TuneNet):
         pays: a network step pays if it brings the loss below this share of the lowest so far.
         patience: the finish takes over after this many steps in succession that do not pay.
         near: a simulated point counts as near up to this distance in any coordinate, unit cube.
-        finish: options of the finish.
     """
 
     name: ClassVar[str] = "hybrid"
@@ -137,9 +136,9 @@ class TuneNetLeastSquares(TuneNet):
     ) -> SimulationGenerator[LinearModel]:
         """Build the linear model of the residuals around the point with the lowest loss.
 
-        Simulations nearby are used for the Jacobian, since they cost nothing more (1): it has
-        secants to these points, and finite differences, which are simulated, in the remaining
-        directions.
+        The Jacobian J is the least-squares solution of J s = y (1) for steps s from that point and
+        changes y of the residual. They are secants to nearby points, which have been simulated
+        already, and finite differences, which are simulated here, in the remaining directions.
 
         Args:
             run: record of all simulations of the run, extended in place.
@@ -163,6 +162,7 @@ class TuneNetLeastSquares(TuneNet):
             probe_points = np.clip(point + missing * inward[:, None], 0.0, 1.0)
             residuals = yield from run.simulate(probe_points)
             is_complete = ~np.isnan(residuals).any(axis=1)
+            # Failed simulations give no difference.
             directions = np.concatenate([directions, (probe_points - point)[is_complete]])
             changes += list(residuals[is_complete] - residual)
         # If no simulation nearby succeeded, the model predicts no decrease.

@@ -154,7 +154,7 @@ class LeastSquares(Tuner):
     def _compute_differences(
         self, run: EvaluationHistory, point: Array, residual: Array, longest: float
     ) -> SimulationGenerator[LinearModel]:
-        """Compute one-sided differences, inward at the upper bound.
+        """Compute the linear model at a point by one-sided differences, inward at the upper bound.
 
         If a simulation fails, the difference is taken on the other side.
 
@@ -182,11 +182,17 @@ class LeastSquares(Tuner):
     ) -> SimulationGenerator[LinearModel]:
         """Run Levenberg-Marquardt on the chosen samples until convergence or lack of progress.
 
-        It starts from the point of the linear model (point, residual, Jacobian). After each step
-        the Jacobian gets Broyden's update; it is computed again by finite differences when it is
-        outdated. `is_selected` masks the residuals, for example to a short horizon at first, since
-        a long simulation can have many local minima. The linear model at the last point is
-        returned.
+        After each step the Jacobian gets Broyden's update; it is computed again by finite
+        differences when it is outdated.
+
+        Args:
+            run: record of all simulations of the run, extended in place.
+            model: linear model (point, residual, Jacobian) at the starting point; changed in place.
+            is_selected: mask of the residuals to fit, for example of a short horizon at first,
+                since a long simulation can have many local minima.
+
+        Returns:
+            The linear model at the last point.
         """
         convergence_share = (
             _FINAL_CONVERGENCE_SHARE if is_selected.all() else _HORIZON_CONVERGENCE_SHARE
@@ -219,7 +225,7 @@ class LeastSquares(Tuner):
                 model.residual = residual
             decrease = error_before - error_after
             model.trusted = decrease > _MIN_TRUST_RATIO * predicted_decrease
-            damping.adapt(decrease / predicted_decrease)  # (2)
+            damping.adapt(decrease / predicted_decrease)  # the gain (2)
             failed_steps = 0 if is_better else failed_steps + 1
             has_progress = error_after < (1.0 - self.progress) * error_before
             stalled_steps = 0 if has_progress else stalled_steps + 1
@@ -243,7 +249,10 @@ class _Damping:
     nu: float = 2.0
 
     def adapt(self, gain: float) -> None:
-        """Adapt the damping to the result of a step.
+        """Adapt the damping mu to the result of a step, by Nielsen's rule (3).
+
+        With a gain above zero, mu is multiplied by max(1/3, 1 - (2 gain - 1)^3). With another gain
+        it is multiplied by nu, which doubles each time in a row.
 
         Args:
             gain: ratio of actual to predicted decrease; NaN for a failed simulation.
@@ -322,6 +331,8 @@ class LinearModel:
     def apply_broyden_update(self, step: Array, residual: Array) -> None:
         """Apply Broyden's update, the smallest Jacobian change that explains a step's result.
 
+        It is J + (r(θ + s) - r - J s) s^T / (s^T s) (4), with the residual r and the step s.
+
         Args:
             step: (dim,) step from the point.
             residual: (samples,) residual after the step.
@@ -352,6 +363,7 @@ class EvaluationHistory:
     finished: bool = False
 
     def __post_init__(self) -> None:
+        # `enough` is the loss at which the target counts as reproduced.
         observed = np.nan_to_num(self.task.observed) / self.task.scale
         self.enough = self.reproduced * float(np.sqrt(np.mean(observed**2)))
 
