@@ -126,7 +126,8 @@ class GaussianProcess:
         def objective(hyper: Array) -> tuple[float, Array]:
             """Compute the negative log posterior of the hyper-parameters, and its gradient.
 
-            `hyper` (dim + 1,) are the logarithms of the length scales and of the noise.
+            Args:
+                hyper: (dim + 1,) logarithms of the length scales and of the noise.
             """
             value, slope = self._compute_negative_evidence(hyper)
             # The priors are normal distributions of the logarithms; z is in standard deviations.
@@ -223,10 +224,11 @@ def _compute_cholesky_factor(matrix: Array, jitter: float) -> Array:
 
 
 def _compute_mean_and_variance(lower: Array, values: Array) -> tuple[float, float, Array]:
-    """Return the maximum-likelihood constant mean and variance, and K⁻¹(values - mean).
+    """Return the maximum-likelihood constant mean and variance, and K⁻¹(values - mean), (n,).
 
-    `lower` is the Cholesky factor (n, n) of K, the correlation of the n points with noise; `values`
-    (n,) are the function values there.
+    Args:
+        lower: (n, n) Cholesky factor of K, the correlation of the n points with noise.
+        values: (n,) function values at the points.
     """
     from scipy.linalg import cho_solve
 

@@ -153,8 +153,9 @@ def predict_proposals(
     """
     target_row = target[..., None, :]
     differences = simulations - target_row
+    # Root mean square, and direction of the difference.
     size = xp.sqrt((differences**2).mean(axis=-1, keepdims=True) + _MIN_STEP_LENGTH**2)
-    unit = differences / size  # (1)
+    unit = differences / size
     base_features = [
         unit,
         xp.log(size + _SIGMA_ZERO),
@@ -187,9 +188,16 @@ def predict_proposals(
 def _compute_step_features(xp: Any, differences: Any, proposed: Any) -> tuple[Any, Any]:
     """Compute the direction of each step, and the slope (2): change of the difference per length.
 
-    Both are zero for the first simulation, which has no step before it. `xp` is numpy or torch,
-    `differences` the projected differences d of (1) and `proposed` the points e, both with one row
-    per simulation. The slope is returned as arsinh, because it can be very large.
+    Both are zero for the first simulation, which has no step before it.
+
+    Args:
+        xp: module numpy or torch.
+        differences: (..., k, d) projected differences of k simulations from the target.
+        proposed: (..., k, dim) points of the simulations.
+
+    Returns:
+        Unit vectors (..., k, dim) of the steps, and slopes (..., k, d) as arsinh, because they can
+        be very large.
     """
     step = proposed[..., 1:, :] - proposed[..., :-1, :]
     length = xp.sqrt((step**2).sum(axis=-1, keepdims=True) + _MIN_STEP_LENGTH**2)
@@ -204,9 +212,15 @@ def _compute_step_features(xp: Any, differences: Any, proposed: Any) -> tuple[An
 def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
     """Compute the attention of each token (..., k, width) to itself and to earlier tokens.
 
-    This is Eq. 1 of Vaswani et al. with a learned bias for each lag (number of tokens between two).
-    `xp` is numpy or torch, `w` the weights, `block` the number of the block, and `h` are the
-    tokens.
+    A token asks with its query, and gets the mean of the values of the tokens, weighted by softmax
+    of query . key / sqrt(width) (Eq. 1 of Vaswani et al., 2017), plus a learned bias for each lag
+    (number of tokens between two).
+
+    Args:
+        xp: module numpy or torch.
+        w: weight arrays as in `get_weight_shapes`.
+        block: number of the block.
+        h: (..., k, width) tokens, in the order of the simulations.
     """
     count, token_size = h.shape[-2:]
     projections = _apply_linear_layer(w, f"heard{block}", h)
@@ -214,6 +228,7 @@ def _compute_causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) ->
     key = projections[..., token_size : 2 * token_size]
     value = projections[..., 2 * token_size :]
     lag = np.arange(count)[:, None] - np.arange(count)
+    # Subtracted from the scores of later tokens, so that their attention is zero.
     future_penalty = xp.asarray(np.where(lag < 0, _CAUSAL_MASK_OFFSET, 0.0).astype(np.float32))
     score = (
         query @ key.swapaxes(-1, -2) / token_size**0.5 + w[f"lag{block}.bias"][np.maximum(lag, 0)]
@@ -245,6 +260,9 @@ _BETA_PARAMETER = 2.0
 
 def draw_binary_search(simulator: TrainingSimulator, rng: np.random.Generator, count: int) -> Array:
     """Draw a target and a random binary search for it, in the training range.
+
+    In each parameter, the next point is l + r (u - l) (7), with the nearest point l tried below the
+    target, the nearest one u above it (6), and a random share r.
 
     Args:
         simulator: training simulator.

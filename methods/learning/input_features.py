@@ -186,6 +186,10 @@ class InputFeatures:
         Arrays named `inputs.*` describe the features of observations, arrays named `told.*` those
         of scenarios.
 
+        Args:
+            state: arrays by name; other names, such as those of weights, are allowed.
+            reading: configuration of the inputs.
+
         Returns:
             The map, and the arrays of other names.
 

@@ -126,6 +126,10 @@ def check_shapes(
 ) -> dict[str, Array]:
     """Return the arrays in the order of the expected names, after a check of their shapes.
 
+    Args:
+        arrays: arrays by name, such as those of a weights file.
+        expected: shape of each array by name.
+
     Raises:
         ValueError: arrays have other names or shapes, or numbers that are not finite.
     """

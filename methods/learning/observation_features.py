@@ -264,6 +264,9 @@ def _compute_weight_per_deviation(weight: Array, deviation: Array) -> Array:
 def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array, Array]:
     """Fit each number as a linear function of the parameters within scenarios.
 
+    In each scenario, x - mean = d slopes + residual (1) is solved by least squares, with the number
+    x of a simulation and the differences d of its parameters from their mean.
+
     Args:
         parameters: (scenarios, m, dim) parameters of m simulations in each scenario.
         rows: (scenarios, m, D) numbers of their observations.

@@ -122,6 +122,9 @@ def estimate_difference(
 ) -> Array:
     """Compute h(proposed, target), the estimated parameter difference target - proposed.
 
+    It is the network's output n for these inputs (1), or, if antisymmetric, half the difference of
+    n(proposed, target) and n(target, proposed) (2), so that equal inputs give zero.
+
     Args:
         weights: weight arrays as in `get_weight_shapes`.
         design: design of the network.
@@ -247,6 +250,13 @@ def _convert_to_tensors(rows: PairInputs, parameters: Array) -> tuple[Any, Any, 
     """Convert input rows of both sides and parameters to float32 tensors.
 
     If both sides have the same rows, they share one tensor, which saves memory.
+
+    Args:
+        rows: input rows of the proposed side and of the target's side.
+        parameters: (scenarios, m, dim) parameters.
+
+    Returns:
+        Rows of the proposed side, rows of the target's side, and parameters.
     """
     import torch
 
@@ -264,7 +274,8 @@ def _make_loss(
 ) -> Callable[[Any, Any, Any], Any]:
     """Return a function that computes the loss (3) without the penalty on the weights.
 
-    It is the mean squared error of the estimated parameter differences, relative to their size.
+    It is the mean squared error of the estimated parameter differences, relative to their size. The
+    estimate is the network's output n (1), or, if antisymmetric, half of n(a, b) - n(b, a) (2).
 
     The function's arguments are the input rows of the proposed side (n, m, D) and of the target's
     side (n, m, E), and the parameters (n, m, dim), for n scenarios of m simulations.
@@ -291,8 +302,9 @@ def _make_loss(
     def objective(x: Any, target_rows: Any, y: Any) -> Any:
         """Compute the mean squared error of the estimated parameter differences.
 
-        All m (m - 1) / 2 pairs of the m simulations of a scenario are used. With `is_target_only`
-        (one input), the network estimates the parameters y themselves from the target's side.
+        All m (m - 1) / 2 pairs of the m simulations of a scenario are used. Unless published, the
+        error of a pair is relative to the squared difference (3). With `is_target_only` (one
+        input), the network estimates the parameters y themselves from the target's side.
 
         Args:
             x: (n, m, D) input rows of the proposed side, for n scenarios of m simulations.

@@ -90,12 +90,17 @@ def _compute_run_response(series: Array, inputs: Array) -> Array:
     observations.
 
     Shapes: T samples, C channels, U inputs.
+
+    Args:
+        series: (n, T, C) channels without gaps.
+        inputs: (T, U) inputs, held between samples.
     """
     half_width = max(3, series.shape[1] // (2 * _BUMPS_PER_RUN))
     bump_width = half_width + 1
+    # Position in the bump, from -1 to 1, without its ends, where the bump is zero.
     s = np.arange(-half_width, half_width + 1) / (half_width + 1.0)
     parabola = 1 - s**2
-    bump = parabola**4  # (3)
+    bump = parabola**4
     # Derivatives w' and w'' of the bump, per sample.
     slope = -8 * s * parabola**3 / bump_width
     second_derivative = (48 * s**2 * parabola**2 - 8 * parabola**3) / bump_width**2
@@ -145,6 +150,10 @@ def _fit_ridge_regression(regressors: Array, values: Array) -> Array:
     """Compute ridge least squares (n, R, C) of values (n, J, C) on regressors (n, J, R).
 
     Each of the n observations is fitted separately.
+
+    Args:
+        regressors: (n, J, R) values of R terms in J equations.
+        values: (n, J, C) right-hand sides of the J equations for each of C channels.
     """
     # Scaled to mean square 1, so that the ridge has the same effect on every regressor.
     size = np.sqrt((regressors**2).mean(axis=1, keepdims=True)) + _MIN_DIVISOR
@@ -254,6 +263,12 @@ def _compute_unscaled_numbers(
     """Compute the numbers (n, K) that describe a scenario, for each of n observations (n, T, C).
 
     They are the initial values, and the response coefficients if inputs vary between scenarios.
+
+    Args:
+        observations: (n, T, C) observations in this scenario.
+        lengths: number of samples of each run; T in total.
+        scene: initial values and inputs of the scenario.
+        has_varying_inputs: whether inputs vary between the scenarios of the training.
     """
     initial = np.broadcast_to(scene.initial, (len(observations), len(scene.initial)))
     if not has_varying_inputs:

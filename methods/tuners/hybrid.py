@@ -210,7 +210,9 @@ class TuneNetLeastSquares(TuneNet):
 def _compute_orthogonal_complement(basis: list[Array], dim: int) -> Array:
     """Return orthonormal directions (m, dim) orthogonal to `basis`; the axes if it is empty.
 
-    `basis` are orthonormal vectors (dim,): directions in which the slope is already known.
+    Args:
+        basis: orthonormal vectors (dim,): directions in which the slope is already known.
+        dim: number of parameters.
     """
     if not basis:
         return np.eye(dim)

@@ -261,8 +261,8 @@ class _Damping:
             self.mu *= max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
             self.nu = 2.0
         elif np.isnan(gain):
-            # The step becomes a quarter if the parameters do not interact, because (1) divides by 1
-            # + mu.
+            # If the parameters do not interact, Marquardt's step is that of Gauss-Newton divided by
+            # 1 + mu; so it becomes a quarter.
             self.mu = 4.0 * self.mu + 3.0
         else:
             self.mu *= self.nu

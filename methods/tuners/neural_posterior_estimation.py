@@ -110,7 +110,8 @@ class NeuralPosteriorEstimation(Tuner):
                 show_progress_bars=False,
             )
             trainer.append_simulations(_to_tensor(theta), _to_tensor(feature_rows))
-            # The minimum (1), until the loss of sbi's held-out rows no longer decreases.
+            # Minimises the mean of -log q(parameters | inputs) of the flow's density q, until this
+            # loss no longer decreases on the rows that sbi holds out.
             self._flow = trainer.train(
                 max_num_epochs=self.epochs,
                 training_batch_size=min(100, len(feature_rows) // 4),
@@ -166,7 +167,11 @@ class NeuralPosteriorEstimation(Tuner):
     def _rebuild_flow(self, arrays: dict[str, Array], inputs: int) -> Any:
         """Rebuild the trained normalising flow from its arrays, such as those of a weights file.
 
-        `inputs` is the number of input features; the number of parameters follows from the arrays.
+        The number of parameters follows from the arrays.
+
+        Args:
+            arrays: arrays of the flow, by sbi's names.
+            inputs: number of input features.
 
         Raises:
             ValueError: the arrays are not those of a flow of the default design.
@@ -178,6 +183,7 @@ class NeuralPosteriorEstimation(Tuner):
             array.size for name, array in arrays.items() if name.endswith("_transforms.0._shift")
         }
         dim = sizes.pop() if sizes else 0
+        # A damaged file could state any number, and a flow of this size would be built.
         if not 0 < dim < 1000:
             raise ValueError("expected the arrays of a flow, found others")
         rng = np.random.default_rng(0)

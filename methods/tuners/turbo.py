@@ -210,8 +210,12 @@ def _draw_sobol_points(rng: np.random.Generator, n: int, dim: int) -> Array:
 def _fit_gaussian_process(points: Array, values: Array) -> Any:
     """Fit a Gaussian process with a scaled Matérn-5/2 kernel by its marginal likelihood.
 
-    `points` (n, dim) are in the unit cube, `values` (n,) have mean 0 and standard deviation 1.
-    Returns botorch's model, ready for prediction.
+    Args:
+        points: (n, dim) points of the unit cube.
+        values: (n,) values there, with mean 0 and standard deviation 1.
+
+    Returns:
+        botorch's model, ready for prediction.
     """
     import torch
     from botorch.exceptions.errors import ModelFittingError
