@@ -163,6 +163,9 @@ def _read_source(path: Path, key: str, table: Mapping[str, Any], default: str = 
         key: Name of the table, for messages.
         table: Content of the table.
         default: Name of the column where none is stated; `key` if empty.
+
+    Raises:
+        InputError: An entry has a wrong type, or there is not one weight for each column.
     """
     file = check_text(path, f"{key}.file", table.get("file", ""))
     column = table.get("column", default or key)

@@ -209,6 +209,9 @@ class RecordingTable:
         Args:
             header: Names of the columns.
             records: Cells of each row below the header.
+
+        Returns:
+            Name of the run of each row, and the numeric columns by name.
         """
         names: list[str] = []
         blocks: dict[str, list[Array]] = {name: [np.empty(0)] for name in self.numeric}
@@ -222,7 +225,12 @@ class RecordingTable:
         return names, {name: np.concatenate(numbers) for name, numbers in blocks.items()}
 
     def _iterate_records(self) -> Iterator[list[str]]:
-        """Iterate over header and rows; skip blank lines."""
+        """Iterate over header and rows; skip blank lines.
+
+        Raises:
+            InputError: The file is not a CSV table, such as with a quotation mark that is not
+                closed.
+        """
         with self.path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True, skipinitialspace=True)
             try:
@@ -243,6 +251,10 @@ class RecordingTable:
 
         Returns:
             Names without spaces around them.
+
+        Raises:
+            InputError: A column is missing, unnamed, given twice or not declared, or the separator
+                is not a comma.
         """
         header = [cell.strip() for cell in cells]
         # A single column is most likely due to another separator.
@@ -379,7 +391,7 @@ class RecordingTable:
         for name in self.channels:
             if np.isnan(columns[name]).all():
                 raise InputError(f"{self.path}: column {name} has no sample; leave the channel out")
-        # First row of each run, and the number of rows.
+        # `edges` are the first row of each run, and the number of rows.
         changes = [row for row in range(1, len(names)) if names[row] != names[row - 1]]
         edges = [0, *changes, len(names)]
         self._check_times_increase(columns["t"], edges)

@@ -80,6 +80,9 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
         path: Path of the description, for messages.
         meta: Content of the description.
 
+    Returns:
+        The switch column of each actuator that has one.
+
     Raises:
         InputError: A column name is not a text, or a drive has both keys.
     """

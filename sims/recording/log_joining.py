@@ -99,6 +99,7 @@ class _FolderLogs:
             channels: Names of the measured signals.
             inputs: Names of the inputs.
         """
+        # Column of stamps, sampling rate in Hz (0 with stamps), and unit of the stamps in seconds.
         self._time, self._rate, self._second = sources.time, sources.rate, sources.second
         self._channels, self._inputs, self._extra = channels, inputs, list(sources.extra)
         self._sources = {
@@ -107,7 +108,7 @@ class _FolderLogs:
         }
         files = {name: self._sources[name].file or default_file for name in (*channels, *inputs)}
         for name, source in sources.extra.items():
-            (column,) = source.columns
+            (column,) = source.columns  # an extra column is never a sum of several
             files[name] = source.file or _find_file(folder, column, list(files.values()))
         columns_by_file: dict[str, set[str]] = {}
         for name, file in files.items():
@@ -231,8 +232,11 @@ class _FolderLogs:
         A signal may be a weighted sum of several columns, for example of coupled drives.
 
         Args:
-            signal: Name of the channel or input.
+            signal: Name of the channel, input or extra column.
             rows: Rows of its log that belong to the run.
+
+        Raises:
+            InputError: a column is missing, or shorter than the column of stamps.
         """
         log = self._logs[signal]
 

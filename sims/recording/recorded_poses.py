@@ -75,6 +75,9 @@ def convert_quaternions(
         reference: (4,) orientation of the body in the model file, a unit quaternion.
         where: beginning of error messages.
 
+    Returns:
+        The channels by name, with yaw, pitch and roll in rad relative to `reference`.
+
     Raises:
         InputError: a quaternion has another length than 1, or a pitch is close to 90 degrees.
     """

@@ -123,7 +123,8 @@ class Run:
             times=self.times[rows],
             channels=cut(self.channels),
             inputs=cut(self.inputs),
-            # The known initial state belongs to the first sample of the whole run.
+            # The known initial state belongs to the first sample of the whole run. A start of None
+            # or 0 is this sample.
             initial={} if rows.start else self.initial,
             extra=cut(self.extra),
             off=cut(self.off),
@@ -461,6 +462,9 @@ def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]
         path: path of the recording, for messages.
         runs: all runs.
         folds: whether to cross-validate two or three unmarked runs.
+
+    Returns:
+        The runs with `held_out` or `fold` set.
 
     Raises:
         InputError: all runs are marked as held out, or a single run is too short.

@@ -369,7 +369,8 @@ class _DescriptionReader:
         title = check_text(path, "title", meta.get("title", path.stem))
         channels = self.read_channels()
         orientations = self._find_orientations(channels)
-        # The effect of some inputs depends on quantities that a recording does not contain.
+        # A robot has inputs that cannot be recorded, since their effect depends on quantities that
+        # a recording does not contain.
         refusal_reasons: Mapping[str, str] = getattr(self.system, "refused_inputs", {})
         input_tables = self._get_tables("inputs", refusal_reasons)
         for name, reason in refusal_reasons.items():
@@ -485,6 +486,9 @@ class _DescriptionReader:
             name: Name of the signal.
             value: Table from the description.
             unit: SI unit of the signal.
+
+        Raises:
+            InputError: An entry is unknown or malformed, or the unit does not convert.
         """
         path, location = self.path, f"{kind} {name}"
         expected = f'unit = "{unit}"'
@@ -668,6 +672,9 @@ class _DescriptionReader:
         Args:
             name: name of the run.
             value: its entry in the description, which must be a table.
+
+        Raises:
+            InputError: an entry is unknown, malformed, impossible, or a constant is given twice.
         """
         location = f"runs.{name}"
         table = check_table(self.path, location, value)
@@ -687,6 +694,7 @@ class _DescriptionReader:
             raise InputError(f"{self.path}: {location}: constant {repeated_name} is given twice")
         constants |= self._read_constants(location, direct_constants)
         self._check_constants_possible(location, constants)
+        # The filters of a robot's actuators have states, too (activations).
         states = [*self.declared.states, *getattr(self.system, "activations", ())]
         initial = self._read_numbers(f"{location}.initial", table.get("initial", {}), states)
         return RunMetadata(constants, initial, held_out)

@@ -41,7 +41,7 @@ def name_numbered_columns(
     Returns:
         The numbers (T,) by the new names, and the numbered columns that they replace.
     """
-    # Columns of names by their numbers, for each prefix, opening and closing bracket.
+    # Columns of names by their numbers, for each style: prefix, opening and closing bracket.
     name_columns: dict[tuple[str, str, str], dict[int, str]] = {}
     for column in texts:
         match = _NUMBERED_COLUMN_PATTERN.fullmatch(column)
@@ -55,12 +55,15 @@ def name_numbered_columns(
     replaced: set[str] = set()
     for style, names_by_number in name_columns.items():
         numbers = sorted(names_by_number)
+        # (k, T) names, of k columns in T rows.
         names = [list(texts[names_by_number[number]]) for number in numbers]
         for stem, columns_by_number in _group_numbered_columns(columns, *style).items():
+            # Without a name for each column, the names belong to other columns.
             if columns_by_number.keys() != names_by_number.keys():
                 continue
             values = np.column_stack([columns[columns_by_number[number]] for number in numbers])
             entries = _sort_by_name(values, names, f"{stem}.")
+            # A new name must not hide a column of the log.
             if entries and not entries.keys() & columns.keys():
                 named_columns |= entries
                 replaced |= set(columns_by_number.values())

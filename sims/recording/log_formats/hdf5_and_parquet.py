@@ -59,9 +59,9 @@ def _is_list(kind: Any) -> bool:
 
 
 def _convert_to_numbers(column: Any) -> Array | None:
-    """Return the numbers of a column as floats; None if it holds none.
+    """Return the numbers of a column as floats; None if it holds no numbers.
 
-    Time stamps become integers in their own unit, and booleans 0 and 1.
+    Time stamps become numbers in their own unit, and booleans 0 and 1.
 
     Args:
         column: Column of a pyarrow table.
@@ -105,7 +105,8 @@ def is_hdf5(path: Path) -> bool:
 def split_group_path(path: Path) -> tuple[Path, str] | None:
     """Split a path into an HDF5 file and a group in it; None if it is not inside such a file.
 
-    The group of the file itself is ``/``.
+    The group of the file itself is ``/``. A path in a file, such as ``demo.hdf5/data/demo_3``, does
+    not exist on disk; the first of its parents that exists is the file.
     """
     if is_hdf5(path):
         return path, "/"

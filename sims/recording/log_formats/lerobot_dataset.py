@@ -184,6 +184,12 @@ def read_calibration(path: Path) -> dict[str, MotorRange]:
     The file states which positions of a motor, in encoder counts, are the ends of the normalised
     range, and whether its sign is reversed (``drive_mode``).
 
+    Args:
+        path: JSON file with a table for each motor.
+
+    Returns:
+        Range of each motor by name.
+
     Raises:
         InputError: The file is not a calibration file, or a range is empty; the message is one
             line.

@@ -353,7 +353,8 @@ def is_bag(path: Path) -> bool:
 def split_bag_path(path: Path) -> tuple[Path, str] | None:
     """Split a path into a bag and a topic inside it; None if the path is not inside a bag.
 
-    The topic has a leading slash.
+    The path ``drive.bag/joint_states`` names the topic ``/joint_states`` of the bag ``drive.bag``.
+    It does not exist on disk; the first of its parents that exists is the bag.
     """
     container = next((parent for parent in path.parents if parent.exists()), None)
     if container is None or not is_bag(container):
