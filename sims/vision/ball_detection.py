@@ -124,6 +124,7 @@ class BallDetection(NamedTuple):
         Args:
             radius: Known radius, pixels.
         """
+        # Too few edge points, such as none of a ball of a few pixels.
         if len(self.edges) < _MIN_REFIT_RAY_SHARE * _RAY_COUNT:
             return self
         u, v = self.u, self.v
@@ -147,6 +148,7 @@ class BallDetection(NamedTuple):
             v += dv
             if abs(du) + abs(dv) < _CENTRE_TOLERANCE:
                 break
+        # So far away, the circle follows the edge of another object.
         if np.hypot(u - self.u, v - self.v) > 0.5 * radius:
             return self
         return self._replace(u=u, v=v)
@@ -206,6 +208,8 @@ class BallDetector:
         else:
             shadow_mask = np.zeros(mask.shape, bool)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        # The largest regions are those with the longest contours; the index avoids that contours of
+        # equal length are compared.
         lengths = [(len(c), i) for i, c in enumerate(contours) if len(c) > 3]
         longest_contours = sorted(lengths, reverse=True)[:_MAX_REGIONS]
         detections = []
@@ -415,6 +419,7 @@ class BallDetector:
             if edges is None:
                 return None
             fitted = circle_fit.fit_circle(edges, (u, v, None))
+            # With fewer rays on the circle, a shadow may bias the fit.
             is_good = (
                 fitted is not None
                 and circle_fit.find_inliers(fitted).sum() >= _GOOD_RAY_AGREEMENT * _RAY_COUNT

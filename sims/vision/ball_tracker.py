@@ -203,7 +203,8 @@ def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[Tracked
                 path.append(frame, detection)
                 active_paths.append(path)
     paths = [path for path in finished_paths + active_paths if len(path.frames) >= _MIN_PATH_FRAMES]
-    # An object that travels less than its radius counts as one without evidence.
+    # Most evidence first. An object that travels less than its radius counts as one without
+    # evidence.
     return sorted(paths, key=lambda path: -path.evidence * (path.travel > path.radius))
 
 
@@ -365,6 +366,7 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     sample_set = set(sample_frames)
     pictures = [picture for number, (_, picture) in enumerate(frames) if number in sample_set]
     detector = _make_detector(pictures)
+    # Detections in each frame of the part without a cut.
     detections = []
     for number, (_, picture) in enumerate(frames):
         if first_frame <= number < end_frame:
@@ -688,9 +690,10 @@ def estimate_roughness(values: Array) -> float:
     windows = windows[np.ptp(windows, axis=1) > min_motion]
     if not len(windows):
         return float("nan")
-    # A cubic has four coefficients, which reduces the degrees of freedom by four.
+    # A cubic has four coefficients, which reduces the degrees of freedom by four. With an
+    # orthonormal basis of cubics, the fit is a projection.
     cubic = np.vander(np.linspace(-1, 1, _NOISE_WINDOW_SAMPLES), 4)
-    basis = np.linalg.qr(cubic)[0]
+    basis, _ = np.linalg.qr(cubic)
     residuals = windows - windows @ basis @ basis.T
     squares = (residuals**2).sum(axis=1)
     return float(np.sqrt(np.median(squares) / (_NOISE_WINDOW_SAMPLES - 4)))

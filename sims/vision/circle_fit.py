@@ -51,10 +51,10 @@ _INLIER_SHARE = 0.1
 def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -> CircleFit | None:
     """Fit a circle to most of the points by Gauss-Newton with Tukey's weights.
 
-    1. With the distance d of a point from the centre (u, v), the residual is d - R.
-    2. Each iteration solves residual = n . (du, dv) + dR by weighted least squares, with the
-       direction n from the centre to the point.
-    3. The weights are Tukey's, (1 - (residual / width)^2)^2 and zero beyond the width.
+    (1) With the distance d of a point from the centre (u, v), the residual is d - R.
+    (2) Each iteration solves residual = n . (du, dv) + dR by weighted least squares, with the
+        direction n from the centre to the point.
+    (3) The weights are Tukey's, (1 - (residual / width)^2)^2 and zero beyond the width.
 
     Args:
         points: Points (n, 2), pixels.

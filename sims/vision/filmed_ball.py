@@ -88,6 +88,9 @@ class FilmedBall(Simulator):
             film: "projected": the ball's centre is projected by the camera model; "tracked": a film
                 is rendered and tracked.
             settings: Settings of the simulator of the ball, such as its engine.
+
+        Raises:
+            InputError: A name or setting is unknown, or the packages for films are missing.
         """
         super().__init__(constants, observe)
         if film not in FILM_MODES:

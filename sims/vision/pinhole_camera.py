@@ -318,6 +318,9 @@ def _read_section(
         meta: content of the file.
         counts: number of values of each entry; 1 stands for a number, which is not in a list.
 
+    Returns:
+        A number or a tuple of numbers for each entry.
+
     Raises:
         InputError: an entry is missing, unknown, or has another number of values.
     """

@@ -169,6 +169,9 @@ class VideoFile:
         Args:
             path: Video file.
             fps: Frames per second; None for the time stamps of the file.
+
+        Raises:
+            InputError: The file cannot be read, or the frame rate is not plausible.
         """
         require_file(path)
         if fps is not None and not _FRAME_RATE_RANGE[0] <= fps <= _FRAME_RATE_RANGE[1]:
