@@ -312,6 +312,9 @@ def _check_text(path: Path, key: str, value: Any) -> str:
         path: path of the file.
         key: key of the entry in the file.
         value: value of the entry.
+
+    Raises:
+        InputError: it is no text, or an empty one.
     """
     result = check_text(path, key, value, "a text")
     if not result:
@@ -465,6 +468,10 @@ def _set_nominal(parameter: Parameter, number: FittedValue) -> Parameter:
 
     Learned tuners are trained in this range. Its half width is the larger of two: a share of the
     number, and a multiple of the half width of its 95 % interval, if it has one.
+
+    Args:
+        parameter: parameter with its bounds.
+        number: fitted value, with its interval.
 
     Returns:
         The parameter with the number as nominal value, and bounds that include it.

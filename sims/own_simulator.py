@@ -113,6 +113,10 @@ def _evaluate_once(effect: type[Effect], system: type[OwnSimulatorSystem]) -> No
 
     So a missing quantity is reported before a simulation starts.
 
+    Args:
+        effect: Force or dry friction.
+        system: System of the user's simulator.
+
     Raises:
         _NotDeclaredError: The effect uses a mass, gravity or drive that the system does not define.
     """
@@ -191,10 +195,15 @@ class OwnSimulator(SystemSimulator):
     def __setattr__(self, name: str, value: object) -> None:
         """Set an attribute, unless the base class already uses this name.
 
+        Args:
+            name: name of the attribute.
+            value: its value.
+
         Raises:
             InputError: the name is taken.
         """
-        # Otherwise a user's `self.engine = ...` would break the base class far from its cause.
+        # Otherwise a user's `self.engine = ...` would break the base class far from its cause. Each
+        # of these attributes is set once.
         if name in _RESERVED_ATTRIBUTES and name in self.__dict__:
             raise InputError(
                 f"simulator {self.name}: the attribute '{name}' belongs to the base class;"

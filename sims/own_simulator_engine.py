@@ -276,6 +276,10 @@ class _LevelLimits:
         An effect without a place limits the first level of the system.
 
         Shapes: K coefficients.
+
+        Args:
+            batch: Batch of this element alone.
+            world: Simulator whose levels are limited.
         """
         self.acting = [
             (effect, c, effect.place or batch.system.levels[0])

@@ -82,6 +82,10 @@ class SystemSimulator(Simulator):
                 registered.
             fixed: Effects with known coefficients: a number, or a list if an effect has several.
             settings: Settings of the engine, e.g. ``time_step``.
+
+        Raises:
+            InputError: A name is unknown, an effect is named twice or not possible, or a known
+                coefficient is not plausible.
         """
         super().__init__(constants, observe)
         # Instance of the system; names and units are read from its class, `self.system`.
@@ -396,8 +400,12 @@ class SystemSimulator(Simulator):
 def _select_rows(values: Array, rows: Indices) -> Array:
     """Return values[l, rows[l, t]], (L, T), of values (L, R) and rows (L, T).
 
-    There is no copy if the first values are selected in order in all L batch elements. Rows that
-    share their memory (stride zero) are equal.
+    There is no copy if the first values are selected in order in all L batch elements.
+
+    Args:
+        values: (L, R) values of a channel in the stored states.
+        rows: (L, T) number of the stored state of each sample. If all elements have the same, the
+            rows share their memory (stride zero).
     """
     in_order = (rows[:1] == np.arange(rows.shape[1])).all()
     if in_order and (rows.strides[0] == 0 or (rows == rows[:1]).all()):

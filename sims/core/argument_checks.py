@@ -192,8 +192,12 @@ def _bind_arguments(
 def _convert_value(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to the type of its annotation.
 
-    `place` names the argument or its entry in messages, such as ``runs[2]``. The result may
-    differ from the value, for example a list in place of a single entry.
+    The result may differ from the value, for example a list in place of a single entry.
+
+    Args:
+        place: the argument or its entry in messages, such as ``runs[2]``.
+        value: value of the argument or entry.
+        hint: its annotation.
 
     Raises:
         _MismatchError: The value does not match.
@@ -226,6 +230,9 @@ def _convert_annotated(place: str, value: Any, hint: Any) -> Any:
         place: the argument and the position in it, for messages.
         value: value of the argument.
         hint: annotation, ``Annotated[TYPE, Expected(...)]``.
+
+    Raises:
+        _MismatchError: the value, or an entry of it, has a wrong type or is out of range.
     """
     annotated_type, expected = get_args(hint)[:2]
     try:
@@ -235,6 +242,7 @@ def _convert_annotated(place: str, value: Any, hint: Any) -> Any:
         if error.place != place:
             raise
         raise _MismatchError(place, expected.words, value) from None
+    # None is possible only if the type allows it; a range does not apply to it.
     if converted is not None and not expected.allows(converted):
         raise _MismatchError(place, expected.words, value)
     return converted

@@ -59,7 +59,15 @@ def _get_key(field: Field[Any]) -> str:
 
 
 def _restore(kind: Any, value: Any) -> Any:
-    """Restore a value of the type `kind` from plain values; other types are returned unchanged."""
+    """Restore a value from plain values, as JSON gives them.
+
+    Dataclasses, tuples and named tuples are made again, also inside of dicts and optional values;
+    a value of another type is returned unchanged.
+
+    Args:
+        kind: type annotation of the value.
+        value: plain value: number, text, list, dict or None.
+    """
     if value is None:
         return None
     if is_dataclass(kind):

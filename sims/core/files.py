@@ -326,7 +326,11 @@ def open_locked(path: Path, folder: Path) -> IO[str]:
 def hash_file(path: Path, _changed: int, _size: int) -> bytes:
     """Return the SHA-256 hash of a file; cached, as many logs may use the same file.
 
-    Time of change and size are only part of the cache key, so that a changed file is hashed again.
+    Args:
+        path: path of the file.
+        _changed: time of the last change, ns; only part of the cache key, so that a changed file is
+            hashed again.
+        _size: size in bytes, likewise.
     """
     digest = hashlib.sha256()
     with path.open("rb") as file:

@@ -256,12 +256,15 @@ def _smooth_step(instant: Array, times: Array) -> Array:
 
 
 def _apply_lag(signal: Signal, lag: Array) -> Array:
-    """Return a signal (L, S) after a first-order lag (4), at the end of each step.
+    """Return a signal (L, S) after a first-order lag, at the end of each step.
 
-    The result r obeys lag dr/dt = y - r, with the signal y linear within a step. `lag` (L, 1) is
-    the time constant in seconds.
+    The result r obeys lag dr/dt = y - r (4), with the signal y linear within a step.
 
     Shapes: L batch elements, S steps.
+
+    Args:
+        signal: signal before the lag.
+        lag: (L, 1) time constants in seconds.
     """
     decay, mean_weight = compute_lag_response(signal.steps, lag)
     old = shift_by_one_step(signal.values, signal.start)

@@ -152,6 +152,10 @@ def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
     the delay is not above zero, and in steps without length.
 
     Shapes: L batch elements, S steps.
+
+    Args:
+        signal: signal over the steps.
+        delay: (L, 1) delays in seconds.
     """
     step_ends = signal.times
     step_starts = step_ends - signal.steps

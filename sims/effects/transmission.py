@@ -261,8 +261,7 @@ class JointBacklash(DrivenLoad):
         indentation = relative_position - np.clip(relative_position, -0.5 * c[0], 0.5 * c[0])
         # Share of the full damping that acts at this penetration.
         damping_share = np.abs(indentation) / (np.abs(indentation) + CONTACT_DAMPING_DEPTH * c[0])
-        relative_velocity = moment.v[:, :1] - state.v
-        push = CONTACT_FREQUENCY * indentation + 4.0 * damping_share * relative_velocity
+        push = CONTACT_FREQUENCY * indentation + 4.0 * damping_share * (moment.v[:, :1] - state.v)
         force = (1.0 - self.behind(c)) * CONTACT_FREQUENCY * push  # (4)
         # A force against the penetration would pull.
         return np.where(indentation > 0, np.maximum(force, 0.0), np.minimum(force, 0.0))

@@ -79,9 +79,13 @@ class PendulumSystem(System):
         """Return the torque (L, 1) of 1 m/s^2 of horizontal acceleration.
 
         The pendulum swings in the plane of x and the vertical; the hinge supports forces along its
-        axis.
+        axis, which is y.
 
         Shapes: L batch elements.
+
+        Args:
+            moment: state snapshot, with the angle (0 when hanging) as its position.
+            axis: horizontal direction of the acceleration.
         """
         if axis == "y":
             return np.zeros_like(moment.x)

@@ -66,7 +66,9 @@ def make_intrinsics(numba: Any) -> dict[str, Any]:
     def make_pointer_function(kind: Any, target: Any) -> Any:
         """Make a numba function that converts an integer address to a pointer.
 
-        `kind` is the type of the numbers for numba, and `target` the same type for LLVM.
+        Args:
+            kind: type of the numbers at the address, for numba.
+            target: the same type for LLVM.
         """
 
         def to_pointer(context: Any, address: Any) -> Any:  # noqa: ARG001

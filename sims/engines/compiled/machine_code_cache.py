@@ -69,10 +69,13 @@ def load_stored(
 
 
 def _get_machine_code(name: str, compile_code: Callable[[], bytes]) -> bytes:
-    """Return the machine code: from the file `name` of the cache, or compiled.
+    """Return the machine code: from the user's cache, or compiled and stored there.
 
-    Compilation takes up to 20 s, so the code is stored in the user's cache. If the cache cannot
-    be written, each process compiles again.
+    Compilation takes up to 20 s. If the cache cannot be written, each process compiles again.
+
+    Args:
+        name: name of the file in the cache.
+        compile_code: function that compiles the code.
     """
     folder = get_cache_folder()
     path = folder / name
@@ -169,7 +172,12 @@ def make_cached(path: Path, make: Callable[[], bytes], report_wait: Callable[[],
 
 
 def _write_atomically(path: Path, content: bytes) -> None:
-    """Write a file atomically, with the hash of its content."""
+    """Write a file atomically, with the hash of its content in front, by which damage is noticed.
+
+    Args:
+        path: path of the file.
+        content: content without the hash.
+    """
     # The temporary name is fixed, so that the file of a killed process is overwritten by the next.
     partial = path.with_suffix(".part")
     try:

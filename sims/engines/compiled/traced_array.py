@@ -319,7 +319,16 @@ class TracedArray(NDArrayOperatorsMixin):
         """Trace a NumPy ufunc; NumPy calls this method for an operation on a traced array.
 
         Sums, maxima and minima along an axis are traced too (``numpy.add.reduce``); other methods
-        and options are not. An argument ``out`` gets the result.
+        and options are not.
+
+        Args:
+            ufunc: the NumPy function, such as ``numpy.add``.
+            method: ``__call__`` for a plain call, ``reduce`` for a reduction along an axis.
+            *args: its arguments.
+            **kwargs: its options; the traced array ``out`` gets the result.
+
+        Raises:
+            NotTraceableError: the function, its method or an option has no traced version.
         """
         if method == "reduce" and ufunc.__name__ in {"add", "maximum", "minimum"}:
             axis = kwargs.get("axis", 0)
@@ -341,6 +350,15 @@ class TracedArray(NDArrayOperatorsMixin):
         """Trace a NumPy function that is not a ufunc; NumPy calls this method.
 
         Functions that only rearrange elements work on the array of nodes itself.
+
+        Args:
+            func: the NumPy function, such as ``numpy.stack``.
+            types: types of its array arguments, not used.
+            args: its arguments.
+            kwargs: its options.
+
+        Raises:
+            NotTraceableError: the function has no traced version.
         """
         name = func.__name__
         if name in RESHAPING_FUNCTIONS:
@@ -356,8 +374,12 @@ class TracedArray(NDArrayOperatorsMixin):
     def _reduce_axis(self, operation: str, axis: Any, keepdims: bool) -> TracedArray:
         """Combine the elements along an axis with an operation of two operands, such as a sum.
 
-        Elements are combined one after the other, from first to last. An axis of None means all
-        elements. With `keepdims`, the axis stays with length one.
+        Elements are combined one after the other, from first to last.
+
+        Args:
+            operation: name of the operation, such as ``add``.
+            axis: number of the axis; None for all elements.
+            keepdims: whether the axis stays, with length one.
         """
         if axis is None:
             reduced = self.reshape(-1)._reduce_axis(operation, axis=0, keepdims=False)

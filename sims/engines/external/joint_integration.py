@@ -76,9 +76,11 @@ class LinearisedForces:
     """
 
     def __init__(self, element: ElementWork, inertia: float) -> None:
-        """Start with zero forces; both states of a step are evaluated in one call.
+        """Start with zero forces; the force at two velocities is evaluated in one call.
 
-        `inertia` is the inertia at the joint, in kg m^2 on a hinge or kg on a guide.
+        Args:
+            element: Batch element with one coordinate.
+            inertia: Inertia at the joint, in kg m^2 on a hinge or kg on a guide.
         """
         self._forces = ElementForces(element, 2)
         self._inertia = inertia

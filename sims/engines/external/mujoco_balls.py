@@ -199,6 +199,10 @@ class MujocoSoftBall(MujocoMover):
         """Set friction, and the damping with which the contact has this restitution.
 
         The contact is a spring and a damper, which have this restitution only if steps are short.
+
+        Args:
+            restitution: Ratio of normal speeds after and before an impact.
+            friction: Coefficient of Coulomb friction; `advance` applies it.
         """
         if (restitution, friction) != self._contact_values:
             self._contact_values = restitution, friction

@@ -133,7 +133,12 @@ def describe_missing_members(module: ModuleType, protocol: type) -> str:
 
 
 def _accepts_arguments(member: Any, protocol: Callable[..., Any]) -> bool:
-    """Return whether a member can be called with the arguments of the protocol's function."""
+    """Return whether a member can be called with the arguments of the protocol's function.
+
+    Args:
+        member: member of a world module, of any type; None if it is missing.
+        protocol: method of the protocol.
+    """
     if not callable(member):
         return False
     parameters = list(inspect.signature(protocol).parameters.values())[1:]  # the first is self
