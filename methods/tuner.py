@@ -352,6 +352,7 @@ def from_callback(
             point_ready.acquire()
             if failure:
                 raise failure[0]
+            # Without a new point, the optimiser has ended.
             if not to_harness:
                 return outcome[0] if outcome else None
             evaluation = yield np.atleast_2d(to_harness.pop())

@@ -116,7 +116,7 @@ class OwnSimulatorEngine:
             batch: Batch of this element alone.
 
         Returns:
-            (N, C) readings of all channels, at the start and after each `steps_per_sample` steps.
+            (N, C) readings of C channels, at the start and after each `steps_per_sample` steps.
             None if a parameter, constant or initial state is not finite.
         """
         system = batch.system
@@ -306,7 +306,7 @@ class _Forces:
     def __init__(self, batch: IntegrationBatch, world: SteppableSimulator) -> None:
         """Select the forces and dry frictions of this element, with coefficients (K, 1, 1).
 
-        `_last` holds velocity, forces and length (s) of the previous step, from which the
+        `_last_step` holds velocity, forces and length (s) of the previous step, from which the
         simulator's own force is estimated; it is None before the first step.
 
         Args:
@@ -321,7 +321,7 @@ class _Forces:
         self.acts = bool(self.forces or self.frictions)
         self.world = world
         self.batch = batch
-        self._last: tuple[Array, Array, float] | None = None
+        self._last_step: tuple[Array, Array, float] | None = None
 
     def at(self, t: float, inputs: Mapping[str, float], seconds: float) -> Array:
         """Return the sum (D,) of the effects' forces for the next step of the user's simulator.
@@ -367,14 +367,14 @@ class _Forces:
         inertia = get_checked_inertia(self.world)
         v = moment.v[0]
         own_force = np.zeros_like(force)
-        if self._last is not None:
-            last_velocity, applied, last_seconds = self._last
+        if self._last_step is not None:
+            last_velocity, applied, last_seconds = self._last_step
             own_force = np.dot(inertia, v - last_velocity) / last_seconds - applied  # (1)
         limit = sum(float(effect.limit(c, moment)[0, 0]) for effect, c in self.frictions)
         stop = -(np.dot(inertia, v) / seconds + own_force + force)  # (2)
         size = float(np.linalg.norm(stop))
         friction: Array = stop if size <= limit else stop * (limit / size)  # (3)
-        self._last = v, force + friction, seconds
+        self._last_step = v, force + friction, seconds
         return friction
 
     def _read_state(self, observation: Mapping[str, float], names: Sequence[str]) -> Array:

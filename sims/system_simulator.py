@@ -89,7 +89,7 @@ class SystemSimulator(Simulator):
         """
         super().__init__(constants, observe)
         # Instance of the system; names and units are read from its class, `self.system`.
-        self._declared = self.system()
+        self._declared_system = self.system()
         self._stored_steps: dict[tuple[object, ...], _StepsAndInputs] = {}
         self.engine = self._make_engine(engine, settings)
         check_effect_types(effects, fixed)
@@ -156,7 +156,7 @@ class SystemSimulator(Simulator):
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
         """Simulate each parameter vector in one scenario; see `Simulator.simulate`.
 
-        Shapes: T samples, C channels.
+        Shapes: n parameter vectors, T samples, C channels.
 
         Args:
             theta: Parameter vectors (n, dim), physical units.
@@ -209,7 +209,7 @@ class SystemSimulator(Simulator):
         The steps are: time grid, effects on inputs, integration by the engine, effects on
         sensors.
 
-        Shapes: T samples, C channels.
+        Shapes: L batch elements, P parameters, T samples, C channels.
 
         Args:
             theta: (L, P) parameters, including the effects' coefficients.
@@ -238,7 +238,7 @@ class SystemSimulator(Simulator):
                 active_effects, (Force, Friction, Contact, HiddenStateEffect, Level)
             )
             batch = IntegrationBatch(
-                self._declared,
+                self._declared_system,
                 base_theta,
                 constants,
                 x,
@@ -286,6 +286,7 @@ class SystemSimulator(Simulator):
             c.any() and (isinstance(effect, Input) or shifts_time(effect)) for effect, c in acting
         )
         has_shift = any(scenario.offset for scenario in runs.unique_scenarios)
+        # The content of the scenarios is the key; without it, nothing can be looked up.
         if has_effect or has_shift or not runs.contents:
             return compute(runs, acting)
         stored = self._stored_steps.get(runs.contents)
@@ -376,7 +377,7 @@ class SystemSimulator(Simulator):
         Returns:
             Observations (L, T, C).
         """
-        channels = self._declared.observe(motion.x, motion.v, motion.a, batch.constants)
+        channels = self._declared_system.observe(motion.x, motion.v, motion.a, batch.constants)
         names = [c.name for c in self.channels]
         affected_name = self.system.reading(names)
         times = grid.compute_state_times(batch.steps_per_sample)
@@ -399,6 +400,8 @@ class SystemSimulator(Simulator):
 
 def _select_rows(values: Array, rows: Indices) -> Array:
     """Return values[l, rows[l, t]], (L, T), of values (L, R) and rows (L, T).
+
+    Shapes: L batch elements, R stored states, T samples.
 
     There is no copy if the first values are selected in order in all L batch elements.
 

@@ -35,22 +35,22 @@ class BroydenSearch:
     def __init__(self, task: Task) -> None:
         """Begin at the start of the task, with slope -1 in every direction.
 
-        `_slope` (dim, dim) estimates dh/dx. `_last` is the last point with its estimate h,
-        `_residual` the estimate at `best`, and `_setbacks` counts the points since then that were
-        not better. `_fallback` is the middle of the training range, used if the first simulation
-        fails.
+        `_slope` (dim, dim) estimates dh/dx. `_last_evaluation` is the last point with its estimate
+        h, `_best_residual` the estimate at `best`, and `_setbacks` counts the points since then
+        that were not better. `_fallback` is the middle of the training range, used if the first
+        simulation fails.
 
         Args:
             task: task of the target.
         """
         self._slope = -np.eye(task.dim)
         self._fallback = task.training.mean(axis=0)
-        self._last: tuple[Array, Array] | None = None
-        self._residual: Array | None = None
+        self._last_evaluation: tuple[Array, Array] | None = None
+        self._best_residual: Array | None = None
         self._setbacks = 0
         # In one dimension: the largest point known to be too low, and the smallest known too high.
-        self._low = -np.inf
-        self._high = np.inf
+        self._bracket_low = -np.inf
+        self._bracket_high = np.inf
         self.best = task.start
 
     def propose_next(self, point: Array, residual: Array) -> Array:
@@ -66,20 +66,23 @@ class BroydenSearch:
         if not np.isfinite(residual).all():
             # The simulation failed: go half the way to the best point, or to the middle of the
             # training range.
-            fallback = self._fallback if self._residual is None else self.best
+            fallback = self._fallback if self._best_residual is None else self.best
             return (point + fallback) / 2.0
-        if self._last is not None:
-            last_point, last_residual = self._last
+        if self._last_evaluation is not None:
+            last_point, last_residual = self._last_evaluation
             self._update_slope(point - last_point, residual - last_residual)
-        self._last = point, residual
+        self._last_evaluation = point, residual
         # The smallest estimate so far, or another setback.
-        if self._residual is None or residual @ residual < self._residual @ self._residual:
+        if (
+            self._best_residual is None
+            or residual @ residual < self._best_residual @ self._best_residual
+        ):
             self.best = point
-            self._residual = residual
+            self._best_residual = residual
             self._setbacks = 0
         else:
             self._setbacks += 1
-        guess: Array = np.clip(self.best + self._compute_step(self._residual), 0.0, 1.0)
+        guess: Array = np.clip(self.best + self._compute_step(self._best_residual), 0.0, 1.0)
         return self._limit_to_bracket(guess, point, residual) if len(point) == 1 else guess
 
     def _update_slope(self, step: Array, change: Array) -> None:
@@ -137,16 +140,17 @@ class BroydenSearch:
         """
         # A positive estimate means that the target is above the point.
         if residual[0] > 0.0:
-            self._low = max(self._low, point[0])
+            self._bracket_low = max(self._bracket_low, point[0])
         elif residual[0] < 0.0:
-            self._high = min(self._high, point[0])
+            self._bracket_high = min(self._bracket_high, point[0])
         # Inaccurate estimates may contradict each other; then there is no interval.
-        has_bracket = np.isfinite([self._low, self._high]).all() and self._low < self._high
-        if self._setbacks and has_bracket and not self._low < guess[0] < self._high:
+        low, high = self._bracket_low, self._bracket_high
+        has_bracket = np.isfinite([low, high]).all() and low < high
+        if self._setbacks and has_bracket and not low < guess[0] < high:
             max_step = 1.0
-            if self._residual is not None:
-                max_step = _MAX_BISECTION_STEP_RATIO * float(np.abs(self._residual).max())
-            halfway = np.array([(self._low + self._high) / 2.0])
+            if self._best_residual is not None:
+                max_step = _MAX_BISECTION_STEP_RATIO * float(np.abs(self._best_residual).max())
+            halfway = np.array([(low + high) / 2.0])
             limited_guess: Array = np.clip(halfway, self.best - max_step, self.best + max_step)
             return limited_guess
         return guess

@@ -69,24 +69,25 @@ class GaussianProcess:
         self.points = points
         self.values = values
         self.settings = settings
-        self._squares = (points[:, None] - points) ** 2  # (n, n, dim) for all pairs of points
+        # (n, n, dim) for all pairs of points.
+        self._squared_differences = (points[:, None] - points) ** 2
         dim = points.shape[1]
         length, length_width = settings.length
         noise, noise_width = settings.noise
         lengths = np.full(dim, length)
         widths = np.full(dim, length_width)
         # Means and standard deviations of the priors, of the logarithms of lengths and noise.
-        self._centre = np.log(np.append(lengths, noise))
-        self._width = np.append(widths, noise_width)
-        self.hyper = self._centre if hyper is None else hyper
+        self._prior_centre = np.log(np.append(lengths, noise))
+        self._prior_width = np.append(widths, noise_width)
+        self.hyper = self._prior_centre if hyper is None else hyper
         # Two points, or equal values, give no information about a length scale.
         if fit and len(points) > 2 and np.ptp(values) > 0.0:
             self.hyper = self._maximise_posterior()
-        k, _ = self._compute_correlation(self._squares)
+        k, _ = self._compute_correlation(self._squared_differences)
         # Cholesky factor of K, the correlation with noise on its diagonal; alpha is
         # K^-1 (values - mean).
-        self._lower = _compute_cholesky_factor(k, float(np.exp(self.hyper[-1])))
-        self.mean, self.variance, self._alpha = _compute_mean_and_variance(self._lower, values)
+        self._cholesky = _compute_cholesky_factor(k, float(np.exp(self.hyper[-1])))
+        self.mean, self.variance, self._alpha = _compute_mean_and_variance(self._cholesky, values)
 
     def _compute_correlation(
         self, squares: Array, hyper: Array | None = None
@@ -97,7 +98,7 @@ class GaussianProcess:
         length scale.
 
         Args:
-            squares: (n, m, dim) squared differences of the pairs of points.
+            squares: (n, m, dim) squared differences of the pairs of n and m points.
             hyper: (dim + 1,) logarithms of length scales and noise; None for the present ones.
 
         Returns:
@@ -131,11 +132,11 @@ class GaussianProcess:
             """
             value, slope = self._compute_negative_evidence(hyper)
             # The priors are normal distributions of the logarithms; z is in standard deviations.
-            z = (hyper - self._centre) / self._width
-            return value + 0.5 * float(z @ z), slope + z / self._width
+            z = (hyper - self._prior_centre) / self._prior_width
+            return value + 0.5 * float(z @ z), slope + z / self._prior_width
 
-        low = self._centre - 4.0 * self._width
-        high = self._centre + 4.0 * self._width
+        low = self._prior_centre - 4.0 * self._prior_width
+        high = self._prior_centre + 4.0 * self._prior_width
         bounds = list(zip(low, high, strict=True))
         optimum = minimize(
             objective,
@@ -161,7 +162,7 @@ class GaussianProcess:
         from scipy.linalg import cho_solve
 
         n = len(self.values)
-        k, slope = self._compute_correlation(self._squares, hyper)
+        k, slope = self._compute_correlation(self._squared_differences, hyper)
         lower = _compute_cholesky_factor(k, float(np.exp(hyper[-1])))
         _, variance, alpha = _compute_mean_and_variance(lower, self.values)
         # (2.30) with the profiled variance: its quadratic term is the constant n / 2.
@@ -170,7 +171,7 @@ class GaussianProcess:
         inverse = cho_solve((lower, True), np.eye(n))
         outer = np.outer(alpha, alpha)
         weight = 0.5 * (inverse - outer / variance)  # (5.9)
-        by_squares = np.einsum("ij,ijd->d", weight * slope, self._squares)
+        by_squares = np.einsum("ij,ijd->d", weight * slope, self._squared_differences)
         # Chain rule: squares are divided by squared lengths, whose logarithms are the variables.
         by_length = by_squares * -2.0 * np.exp(-2.0 * hyper[:-1])
         by_noise = np.trace(weight) * np.exp(hyper[-1])
@@ -187,7 +188,7 @@ class GaussianProcess:
         """Draw joint samples of the posterior by a Cholesky factor of its covariance (2.26).
 
         Args:
-            points: (m, dim) points of the unit cube.
+            points: (m, dim) m points of the unit cube.
             draws: number of samples.
             rng: random generator.
 
@@ -199,7 +200,7 @@ class GaussianProcess:
         # Correlations with the n known points (m, n), and among the m points.
         cross_correlation, _ = self._compute_correlation((points[:, None] - self.points) ** 2)
         prior, _ = self._compute_correlation((points[:, None] - points) ** 2)
-        explained = solve_triangular(self._lower, cross_correlation.T, lower=True)
+        explained = solve_triangular(self._cholesky, cross_correlation.T, lower=True)
         spread = _compute_cholesky_factor(prior - explained.T @ explained, 1e-10)  # (2.26)
         noise = rng.standard_normal((draws, len(points)))
         centre = self.mean + cross_correlation @ self._alpha  # (2.25)

@@ -144,8 +144,8 @@ def predict_proposals(
         xp: module numpy or torch.
         w: weight arrays as in `get_weight_shapes`.
         design: design of the network.
-        target: (..., d) row of the target, projected by W.
-        simulations: (..., k, d) rows of the simulations, projected by W; k is at most the window.
+        target: (..., d) row of the target, projected to d numbers by the weights ``seen``.
+        simulations: (..., k, d) projected rows of the k simulations; k is at most the window.
         tried: (..., k, dim) parameters of the simulations, in half widths from the middle.
 
     Returns:
@@ -192,7 +192,8 @@ def _compute_step_features(xp: Any, differences: Any, proposed: Any) -> tuple[An
 
     Args:
         xp: module numpy or torch.
-        differences: (..., k, d) projected differences of k simulations from the target.
+        differences: (..., k, d) differences of k simulations from the target, each d projected
+            numbers.
         proposed: (..., k, dim) points of the simulations.
 
     Returns:

@@ -55,7 +55,7 @@ class FeatureConfig:
     proposed: FeatureConfig | None = None
 
     def select_channels(self, observations: Array) -> Array:
-        """Return the channels (..., c) of observations (..., C) that are used.
+        """Return the channels (..., c) that are used, of observations (..., C) with C channels.
 
         Indices beyond the last channel are replaced by the last one.
         """
@@ -125,7 +125,7 @@ class InputFeatures:
     ) -> Array:
         """Compute input rows (n, D) from observations (n, T, C) of one scenario.
 
-        Shapes: T samples, C channels.
+        Shapes: n observations, T samples, C channels, D inputs of the network.
 
         Args:
             observations: observations in SI units; NaN for missing samples.

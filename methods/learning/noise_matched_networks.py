@@ -40,6 +40,8 @@ def estimate_noise_sigma(observations: Array, lengths: tuple[int, ...]) -> Array
     smooth motion has nearly none. A run is divided into up to eight parts of at least sixteen
     differences, so that impacts and rattling elsewhere do not count.
 
+    Shapes: n observations, T samples, C channels.
+
     Args:
         observations: (n, T, C) observations; NaN for missing samples.
         lengths: number of samples of each run.

@@ -37,6 +37,8 @@ def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) ->
 
     A network needs inputs of one size, but runs differ in length and lack samples.
 
+    Shapes: n observations, T samples, C channels.
+
     Args:
         observations: (n, T, C) observations with the runs concatenated along T; NaN for missing
             samples.
@@ -96,10 +98,10 @@ def compute_descriptors(series: Array) -> Array:
     Sorted values are independent of time, so they do not change if the motion is shifted in time.
 
     Args:
-        series: (n, series, points).
+        series: (n, series, points) resampled series of n observations.
 
     Returns:
-        (n, series * (4 * points - 2)).
+        (n, series * (4 * points - 2)) numbers of each observation.
     """
     rates = np.diff(series, axis=-1)
     parts = (
@@ -132,7 +134,7 @@ class ObservationFeatures:
     def __call__(self, observations: Array, lengths: tuple[int, ...]) -> Array:
         """Compute input rows (n, D) from observations (n, T, C).
 
-        Shapes: T samples, C channels.
+        Shapes: n observations, T samples, C channels, D inputs of the network.
 
         Args:
             observations: observations in SI units; NaN for missing samples.
@@ -141,6 +143,7 @@ class ObservationFeatures:
         Raises:
             ValueError: the observation yields fewer numbers than the network was trained on.
         """
+        # No number of an observation is used if the network reads features of scenarios alone.
         if not self.chosen.size:
             return np.empty((len(observations), 0))
         raw_features = _compute_feature_rows(observations, lengths, self.points, self.plain)
@@ -162,7 +165,7 @@ def _compute_feature_rows(
 ) -> Array:
     """Compute all candidate numbers (n, D) of observations (n, T, C).
 
-    Shapes: T samples, C channels.
+    Shapes: n observations, T samples, C channels, D candidate numbers.
 
     Args:
         observations: (n, T, C) observations.
@@ -179,7 +182,7 @@ def make_raw_features(
 ) -> ObservationFeatures:
     """Make the published inputs: resampled series in SI units, neither centred nor scaled.
 
-    Shapes: T samples, C channels.
+    Shapes: n observations, T samples, C channels.
 
     Args:
         observations: (n, T, C) observations in SI units.
@@ -269,7 +272,7 @@ def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array
 
     Args:
         parameters: (scenarios, m, dim) parameters of m simulations in each scenario.
-        rows: (scenarios, m, D) numbers of their observations.
+        rows: (scenarios, m, D) the D numbers of each of their observations.
 
     Returns:
         Root mean squares of each number (D,), of the part that each parameter explains (dim, D),

@@ -128,8 +128,9 @@ def estimate_difference(
     Args:
         weights: weight arrays as in `get_weight_shapes`.
         design: design of the network.
-        proposed: (n, D) or (D,) input rows of the proposed simulations.
-        target: (n, E) or (E,) input rows of the targets; E is D if the network is antisymmetric.
+        proposed: (n, D) or (D,) input rows of the proposed simulations, D numbers each.
+        target: (n, E) or (E,) input rows of the targets, E numbers each; E is D if the network is
+            antisymmetric.
 
     Returns:
         (n, dim) or (dim,) differences in the unit cube.
@@ -192,7 +193,7 @@ def train_pair_network(
 
     Args:
         rows: input rows of both sides.
-        parameters: (scenarios, m, dim) parameters in the unit cube.
+        parameters: (scenarios, m, dim) parameters of m simulations per scenario, in the unit cube.
         design: design of the network and of its training.
         rng: seeds the initial weights and the order; global random state is not changed.
         alone: True to learn parameters from the target alone, with a proposed input of zero (the
@@ -253,7 +254,7 @@ def _convert_to_tensors(rows: PairInputs, parameters: Array) -> tuple[Any, Any, 
 
     Args:
         rows: input rows of the proposed side and of the target's side.
-        parameters: (scenarios, m, dim) parameters.
+        parameters: (scenarios, m, dim) parameters of m simulations per scenario.
 
     Returns:
         Rows of the proposed side, rows of the target's side, and parameters.
@@ -308,7 +309,7 @@ def _make_loss(
 
         Args:
             x: (n, m, D) input rows of the proposed side, for n scenarios of m simulations.
-            target_rows: (n, m, E) input rows of the target's side.
+            target_rows: (n, m, E) input rows of the target's side, which may be of another length.
             y: (n, m, dim) parameters.
         """
         b = compute_branch(target_rows, "target")

@@ -39,16 +39,16 @@ class PosteriorRounds:
         """Begin without simulations; the network is made with the first round's components.
 
         `_trainer` and `_posterior` are objects of sbi. `_components` (N, P) are the P principal
-        components of the N residuals, `_centre` (N,) their mean, `_widths` (P,) the spread along
-        each component.
+        components of the N residuals, `_residual_mean` (N,) their mean, `_component_spread` (P,)
+        the spread along each component.
         """
         self.mean: Array | None = None
         self._task = task
         self._trainer: Any = None
         self._posterior: Any = None
         self._components: Array | None = None
-        self._centre: Array = np.zeros(0)
-        self._widths: Array = np.ones(0)
+        self._residual_mean: Array = np.zeros(0)
+        self._component_spread: Array = np.ones(0)
 
     def update(self, evaluation: Evaluation, count: int, rng: np.random.Generator) -> Array:
         """Train on one more round of simulations, and draw the points of the next.
@@ -79,22 +79,25 @@ class PosteriorRounds:
     def _fit_components(self, residuals: Array) -> None:
         """Compute the principal components of the first round's residuals (n, N).
 
-        Later rounds use the same components, so that the network's inputs keep their meaning. At
-        most `_MAX_COMPONENTS` are used; those without variance (rounding errors) are left out.
+        There are N residuals of each of n simulations. Later rounds use the same components, so
+        that the network's inputs keep their meaning. At most `_MAX_COMPONENTS` are used; those
+        without variance (rounding errors) are left out.
         """
-        self._centre = residuals.mean(axis=0)
-        _, singular, directions = np.linalg.svd(residuals - self._centre, full_matrices=False)
+        self._residual_mean = residuals.mean(axis=0)
+        centred = residuals - self._residual_mean
+        _, singular, directions = np.linalg.svd(centred, full_matrices=False)
         component_count = max(
             int((singular[:_MAX_COMPONENTS] > _MIN_SINGULAR_VALUE * singular[0]).sum()), 1
         )
         self._components = directions[:component_count].T
-        spread = ((residuals - self._centre) @ self._components).std(axis=0)
-        self._widths = np.where(spread > 0, spread, 1.0)
+        spread = (centred @ self._components).std(axis=0)
+        self._component_spread = np.where(spread > 0, spread, 1.0)
 
     def _compute_features(self, residuals: Array) -> Array:
         """Return the scaled components of residuals (n, N); a perfect simulation has residual 0."""
         assert self._components is not None
-        features: Array = (residuals - self._centre) @ self._components / self._widths
+        centred = residuals - self._residual_mean
+        features: Array = centred @ self._components / self._component_spread
         return features
 
     def _train_round(self, points: Array, features: Array, count: int) -> Array:
@@ -105,7 +108,7 @@ class PosteriorRounds:
 
         Args:
             points: (n, dim) simulated points.
-            features: (n, P) scaled principal components of their residuals.
+            features: (n, P) the P scaled principal components of their residuals.
             count: number of points to draw.
         """
         import torch
@@ -122,7 +125,7 @@ class PosteriorRounds:
             proposal=self._posterior,
         )
         self._trainer.train(training_batch_size=min(50, len(points)))
-        zero = self._compute_features(np.zeros((1, len(self._centre))))
+        zero = self._compute_features(np.zeros((1, len(self._residual_mean))))
         target = torch.as_tensor(zero, dtype=torch.float32)
         self._posterior = self._trainer.build_posterior().set_default_x(target)
         # Enough that `count` remain if only a tenth of them lies within the bounds.

@@ -56,6 +56,8 @@ def compute_response_coefficients(
     The acceleration of a channel is fitted by q'' = k0 + k1 q + k3 q^3 + kf sign(q') + ku u + kd q'
     (1), with the terms of all channels q and inputs u, and a smoothed sign.
 
+    Shapes: n observations, T samples, C channels, U inputs.
+
     Args:
         observations: (n, T, C) observations with the runs concatenated along T; NaN for missing
             samples.
@@ -128,7 +130,7 @@ def _compute_run_response(series: Array, inputs: Array) -> Array:
 def _compute_smoothed_velocity_signs(series: Array) -> Array:
     """Compute smoothed signs of the rates of change (n, T, C), a regressor for dry friction.
 
-    Shapes: T samples, C channels.
+    Shapes: n observations, T samples, C channels.
 
     Args:
         series: (n, T, C) observed channels.
@@ -229,7 +231,7 @@ class ScenarioFeatures:
     def __call__(self, observations: Array, lengths: tuple[int, ...], scene: ScenarioInfo) -> Array:
         """Compute network inputs, which grow logarithmically far from the training data.
 
-        Shapes: T samples, C channels.
+        Shapes: n observations, T samples, C channels, K inputs of the network.
 
         Args:
             observations: (n, T, C) observations in SI units.
@@ -260,7 +262,7 @@ class ScenarioFeatures:
 def _compute_unscaled_numbers(
     observations: Array, lengths: tuple[int, ...], scene: ScenarioInfo, has_varying_inputs: bool
 ) -> Array:
-    """Compute the numbers (n, K) that describe a scenario, for each of n observations (n, T, C).
+    """Compute the K numbers (n, K) that describe a scenario, for each of n observations (n, T, C).
 
     They are the initial values, and the response coefficients if inputs vary between scenarios.
 

@@ -27,7 +27,7 @@ class MuJoCoSysId(Tuner):
         """Pass the toolbox's points to the harness, finite differences in one batch."""
 
         def minimise(residuals: Callable[[Array], Array]) -> str:
-            """Minimise residuals (n, N) of points (n, dim); mujoco.sysid has points in columns."""
+            """Minimise the N residuals (n, N) of n points (n, dim); return why it stopped."""
             os.environ.setdefault("MUJOCO_GL", "disable")  # else MuJoCo looks for a display
             sysid = importlib.import_module("mujoco.sysid")  # it has no types
             cube = sysid.ParameterDict()

@@ -70,6 +70,7 @@ class CMAES(Tuner):
                     proposal = Proposal(points, self._get_clipped_mean(strategy, task.dim))
                 evaluation = yield proposal
                 strategy.tell(generation, _rank_failures_last(evaluation.losses))
+            # `stop` has pycma's reasons by name, such as a step size that is too small.
             if not self.restarts:
                 return "pycma: " + ", ".join(strategy.stop())
             # A larger population is less sensitive to a rugged loss; points beyond the budget would

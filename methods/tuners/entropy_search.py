@@ -113,6 +113,7 @@ class EntropySearch(Tuner):
             p = compute_minimiser_probability(process, grid, _PUBLISHED_DRAWS, rng)
             previous_estimate = estimate
             estimate = grid[p.argmax()]
+            # The published criterion, which often stops too early.
             if (
                 previous_estimate is not None
                 and np.abs(estimate - previous_estimate).max() <= self.repeats_within
@@ -158,7 +159,7 @@ class EntropySearch(Tuner):
     def _choose_candidates(
         self, process: GaussianProcess, best: Array, rng: np.random.Generator
     ) -> Array:
-        """Choose the candidates (N, dim) for the next simulation.
+        """Choose N candidates (N, dim) for the next simulation, in the unit cube.
 
         They are the best point so far, `everywhere` quasi-random points in the cube, and `nearby`
         points: half of these around the best point, half around the quasi-random point with the

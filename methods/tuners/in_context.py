@@ -77,7 +77,8 @@ class TrainedHistoryNetwork:
         The network sees points relative to the middle of the training range.
 
         Args:
-            target: (d,) row of network inputs of the target, projected by `apply_weights`.
+            target: (d,) row of network inputs of the target, projected to d numbers by
+                `apply_weights`.
             simulations_seen: such rows (d,) of the simulations so far.
             tried: points (dim,) of the simulations so far.
         """

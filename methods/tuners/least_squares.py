@@ -203,6 +203,7 @@ class LeastSquares(Tuner):
         while stalled_steps < self.patience:
             error_before = model.compute_error(is_selected)
             step, predicted_decrease = model.compute_step(is_selected, damping.mu)
+            # Converged: the step is negligible, or the model predicts too small a decrease.
             if (
                 np.abs(step).max() < self.step_tolerance
                 or predicted_decrease <= convergence_share * error_before
@@ -382,7 +383,7 @@ class EvaluationHistory:
         return self.record(evaluation)
 
     def record(self, evaluation: Evaluation) -> Array:
-        """Record an evaluation of n points, and return its residuals (n, N).
+        """Record an evaluation of n points, and return the N residuals (n, N) of each.
 
         The residuals of a failed simulation are NaN. The run is finished as soon as a loss is at
         most `enough`.

@@ -70,7 +70,7 @@ class NeuralPosteriorEstimation(Tuner):
     draws: int = 1000
     told: bool = True
     _flow: Any = field(default=None, init=False, repr=False)
-    _read: InputFeatures | None = field(default=None, init=False, repr=False)
+    _features: InputFeatures | None = field(default=None, init=False, repr=False)
 
     def fit(self, simulator: TrainingSimulator, rng: np.random.Generator, budget: int) -> None:
         """Train on at most `budget` simulations of the training range.
@@ -91,7 +91,7 @@ class NeuralPosteriorEstimation(Tuner):
         noisy_data = training_data.with_noise(
             self.noise * training_data.flattened_observations.std(axis=(0, 1)), rng
         )
-        self._read = features = InputFeatures.fit(training_data, self._make_feature_config())
+        self._features = features = InputFeatures.fit(training_data, self._make_feature_config())
         # Each simulation is used twice, with and without noise, because targets may be of either
         # kind.
         feature_rows = np.concatenate(
@@ -138,12 +138,12 @@ class NeuralPosteriorEstimation(Tuner):
 
     def state(self) -> dict[str, Array]:
         """Return the flow's tensors and the input features by name; empty before `fit`."""
-        if self._read is None:
+        if self._features is None:
             return {}
         tensors = {
             f"flow.{name}": np.array(t.numpy()) for name, t in self._flow.state_dict().items()
         }
-        return tensors | self._read.to_arrays()
+        return tensors | self._features.to_arrays()
 
     def restore(self, state: dict[str, Array]) -> None:
         """Restore the arrays that `state` returned.
@@ -162,7 +162,7 @@ class NeuralPosteriorEstimation(Tuner):
             {name.removeprefix("flow."): array for name, array in flow_arrays.items()},
             features.feature_count,
         )
-        self._read = features
+        self._features = features
 
     def _rebuild_flow(self, arrays: dict[str, Array], inputs: int) -> Any:
         """Rebuild the trained normalising flow from its arrays, such as those of a weights file.
@@ -209,9 +209,9 @@ class NeuralPosteriorEstimation(Tuner):
             task: start, observations, number of parameters and budget of the run.
             rng: random numbers of the run.
         """
-        if self._read is None:
+        if self._features is None:
             raise RuntimeError("npe has not been trained; call fit or restore first")
-        row = self._read(task.observed[None], task.lengths, task.scene)
+        row = self._features(task.observed[None], task.lengths, task.scene)
         with isolated_library_call(rng):
             count = max(self.draws, task.budget)
             samples = self._flow.sample((count,), condition=_to_tensor(row))

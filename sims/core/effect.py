@@ -178,7 +178,7 @@ class Effect(metaclass=EffectType):
         return themselves.
 
         Args:
-            c: (K, L, 1) coefficients of L batch elements.
+            c: (K, L, 1) the K coefficients of L batch elements.
         """
         return ((self, c),)
 
@@ -381,7 +381,7 @@ class HiddenStateEffect(Effect):
     def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the generalised force and the rate of the hidden state.
 
-        Shapes: L batch elements, D coordinates.
+        Shapes: L batch elements, D coordinates, K coefficients.
 
         Args:
             c: Coefficients (K, L, 1).
@@ -429,7 +429,7 @@ class Contact(Effect):
     def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:  # noqa: ARG002
         """Return the restitution (L, 1).
 
-        Shapes: L batch elements.
+        Shapes: L batch elements, K coefficients.
 
         Args:
             c: Coefficients (K, L, 1).

@@ -22,7 +22,7 @@ def compute_nan_median(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the median over the first axis, ignoring NaN; numpy's takes four times as long.
 
     Args:
-        values: (n, ...) values, NaN where missing; at least one in each column is present.
+        values: (n, ...) values, NaN where missing; at least one of each n values is present.
 
     Returns:
         (...) medians; the mean of both middle values if their number is even.

@@ -39,12 +39,12 @@ class PartUnavailableError(InputError):
     def __init__(self, kind: str, name: str, reason: str) -> None:
         super().__init__(f"{kind} {name} cannot be used here: {reason}")
         self.reason = str(InputError(reason))
-        self._given = kind, name, reason
+        self._arguments = kind, name, reason
 
     def __reduce__(self) -> tuple[type[PartUnavailableError], tuple[str, str, str]]:
         # Errors of worker processes are pickled; by default that would call the class with the
         # message only.
-        return PartUnavailableError, self._given
+        return PartUnavailableError, self._arguments
 
 
 @dataclass(frozen=True)

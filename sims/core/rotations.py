@@ -21,7 +21,7 @@ def compute_yaw_pitch_roll(quaternions: Array, reference: Array) -> Array:
     With the orientation R and the reference R_0, R R_0^-1 = R_z(yaw) R_y(pitch) R_x(roll).
 
     Args:
-        quaternions: (T, 4) orientations (w, x, y, z); NaN where a sample is missing.
+        quaternions: (T, 4) orientations (w, x, y, z) in T samples; NaN where one is missing.
         reference: (4,) orientation in the model file, a unit quaternion.
     """
     # The inverse of a unit quaternion is its conjugate.

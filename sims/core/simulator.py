@@ -340,7 +340,7 @@ class Simulator(ABC):
 
         If a simulation fails numerically, its observation is NaN, and the others are not affected.
 
-        Shapes: T samples, C channels.
+        Shapes: n parameter vectors, T samples, C channels.
 
         Args:
             theta: Parameter vectors (n, dim), physical units.

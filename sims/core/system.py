@@ -340,7 +340,7 @@ class System(ABC):
 
         There is no default: a system does not define it if its engine computes inertia and gravity.
 
-        Shapes: L batch elements.
+        Shapes: L batch elements, p parameters.
 
         Args:
             theta: (L, p) parameters.

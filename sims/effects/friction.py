@@ -332,6 +332,8 @@ class FrictionHysteresis(HiddenStateEffect):
     def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the friction force (L, D), and the rate (L, 1) of the hidden state w (Dahl model).
 
+        Shapes: L batch elements, D coordinates.
+
         The force is -F w with the limit F. w approaches the sign of the velocity v over a distance
         of about the deflection d: w' = r - |r| w, r = v / d (1). |r| is limited, so that (1) can be
         integrated.

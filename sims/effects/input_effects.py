@@ -209,7 +209,7 @@ class InputDeadBand(Input):
 
         Shapes: L batch elements, S steps.
 
-        w = u - clip(u, -c, c) (5).
+        With the command u and the coefficient c, the applied input is w = u - clip(u, -c, c) (5).
 
         Args:
             c: (1, L, 1) half width c; no dead band if not above zero.
@@ -235,7 +235,7 @@ class InputSaturation(Input):
 
         Shapes: L batch elements, S steps.
 
-        w = clip(u, -c, c) (6).
+        With the command u and the coefficient c, the applied input is w = clip(u, -c, c) (6).
 
         Args:
             c: (1, L, 1) limit c; none if not above zero.
@@ -287,7 +287,7 @@ class InputPower(Input):
 
         Shapes: L batch elements, S steps.
 
-        w = (1 + gain) sign(u) |u|^(1 + power) (8).
+        With the command u, the applied input is w = (1 + gain) sign(u) |u|^(1 + power) (8).
 
         Args:
             c: (2, L, 1) coefficients: gain and power.

@@ -118,7 +118,7 @@ class DrivenLoad(HiddenStateEffect):
     def element(self, c: Array) -> SeriesElement:
         """Return the series element: a spring with damper for a compliance, else backlash.
 
-        Shapes: L batch elements.
+        Shapes: L batch elements, K coefficients.
 
         Args:
             c: Coefficients (K, L, 1) in the order of `between`: compliance or gap, damping, and
@@ -139,7 +139,7 @@ class DrivenLoad(HiddenStateEffect):
         """Return the initial state of the load: moving with the drive, at the static deflection.
 
         Args:
-            c: (K, L, 1) coefficients of the effect.
+            c: (K, L, 1) the K coefficients of the effect.
             moment: state snapshot of L batch elements.
         """
         deflection = self.compute_static_deflection(
@@ -175,7 +175,7 @@ class DrivenLoad(HiddenStateEffect):
         stays NaN.
 
         Args:
-            c: (K, L, 1) coefficients.
+            c: (K, L, 1) the K coefficients of L batch elements.
             fall: (L, 1) acceleration by gravity.
         """
         return 0.0 * c[0] * fall

@@ -38,7 +38,7 @@ MAX_LEAD_IN_STEP_SECONDS = 2e-3
 
 
 def _get_command_values(scenario: Scenario, name: str, values: Array) -> Array:
-    """Return the values (K + T,) of an input, including its known history before the run.
+    """Return the values (K + T,) of an input: K of its known history, and T in the run.
 
     Args:
         scenario: Scenario with the history.

@@ -58,6 +58,8 @@ class TimeGrid:
     def compute_state_times(self, steps_per_state: int) -> Array:
         """Return the times (L, R) since the start of the run at which the engine stores states, s.
 
+        Shapes: L batch elements, R stored states.
+
         The first of them is zero, the time of the initial state.
 
         Args:
@@ -128,7 +130,7 @@ def _find_change_times(
 ) -> Array:
     """Return the times (L, K) at which a changed command is applied; zero where there are fewer.
 
-    Shapes: L batch elements.
+    Shapes: L batch elements, at most K changes of all inputs.
 
     With a shift to the time s(t), the change commanded at t is applied at t + (t - s(t)) (1).
 
@@ -169,7 +171,7 @@ def divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Array
     interval needs; steps of zero length fill the last block of an interval. For example, if most
     intervals need 4 steps, an interval with 5 has two blocks, whose last three steps are zero.
 
-    Shapes: S steps, T samples.
+    Shapes: N batch elements, S steps, T times.
 
     Args:
         instants: (N, T) times since the start, s.

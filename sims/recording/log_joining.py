@@ -99,8 +99,9 @@ class _FolderLogs:
             channels: Names of the measured signals.
             inputs: Names of the inputs.
         """
-        # Column of stamps, sampling rate in Hz (0 with stamps), and unit of the stamps in seconds.
-        self._time, self._rate, self._second = sources.time, sources.rate, sources.second
+        # The sampling rate, in Hz, is 0 if the logs have stamps; their unit is given in seconds.
+        self._time_column, self._sampling_rate = sources.time, sources.rate
+        self._seconds_per_unit = sources.second
         self._channels, self._inputs, self._extra = channels, inputs, list(sources.extra)
         self._sources = {
             **{name: sources.signals[name] for name in (*channels, *inputs)},
@@ -112,7 +113,8 @@ class _FolderLogs:
             files[name] = source.file or _find_file(folder, column, list(files.values()))
         columns_by_file: dict[str, set[str]] = {}
         for name, file in files.items():
-            columns = columns_by_file.setdefault(file, set() if self._rate else {self._time})
+            stamp_columns = set() if self._sampling_rate else {self._time_column}
+            columns = columns_by_file.setdefault(file, stamp_columns)
             columns.update(self._sources[name].columns)
         self._logs: dict[str, LogFile] = {
             name: read_log(folder / Path(file), frozenset(columns_by_file[file]))
@@ -195,7 +197,7 @@ class _FolderLogs:
         # stamp is subtracted before scaling.
         first_stamp = min(rows.stamps[0] for rows in rows_of.values())
         return {
-            path: rows._replace(stamps=self._second * (rows.stamps - first_stamp))
+            path: rows._replace(stamps=self._seconds_per_unit * (rows.stamps - first_stamp))
             for path, rows in rows_of.items()
         }, notes
 
@@ -307,17 +309,17 @@ class _FolderLogs:
         Raises:
             InputError: A stamp is missing or decreases, or many stamps repeat the previous one.
         """
-        if self._rate:
+        if self._sampling_rate:
             longest = max(len(values) for values in log.columns.values())
             count = longest if run_rows is None else int(run_rows.sum())
-            return np.arange(count) / self._rate, np.ones(count, dtype=bool)
-        stamps = log.get_column(self._time)
+            return np.arange(count) / self._sampling_rate, np.ones(count, dtype=bool)
+        stamps = log.get_column(self._time_column)
         stamps = stamps if run_rows is None else stamps[run_rows]
-        location = f"{log.path}, column {self._time}"
+        location = f"{log.path}, column {self._time_column}"
         if not np.isfinite(stamps).all():
             row = int(np.flatnonzero(~np.isfinite(stamps))[0]) + log.first
             raise InputError(f"{location}, {log.rows} {row}: expected a stamp, found none")
-        if np.abs(stamps).max() * self._second > MAX_TIMESTAMP_SECONDS:
+        if np.abs(stamps).max() * self._seconds_per_unit > MAX_TIMESTAMP_SECONDS:
             raise InputError(
                 f"{location}: expected stamps in the unit that [time] states, found "
                 f"{stamps[0]:.12g}; is it milliseconds or less?"

@@ -142,7 +142,7 @@ class Run:
             row: Index of the sample.
 
         Returns:
-            (2, K) times relative to the sample (s, negative) and values.
+            (2, K) times relative to the sample (s, negative) and values, K of each.
         """
         # Times in this history are relative to the first sample of the run.
         earlier_times, earlier_values = self.before.get(name, np.empty((2, 0)))

@@ -38,6 +38,7 @@ def select_frames(moved: Array) -> list[int]:
     min_motion = 1e-3 * moved.sum() / max(1, count)
     accumulated = np.cumsum(moved + min_motion + 1e-12)
     targets = np.linspace(accumulated[0], accumulated[-1], min(MAX_BACKGROUND_FRAMES, count))
+    # A target that rounding has raised must not select the next frame.
     frame_numbers = np.searchsorted(accumulated, targets - 1e-12).clip(0, count - 1)
     return sorted(set(frame_numbers.tolist()))
 
@@ -61,7 +62,7 @@ def compute_masked_background(
     """Return the pixelwise median of pictures without the objects that hide the background.
 
     Args:
-        pictures: Pictures (height, width, 3), n of them.
+        pictures: n pictures (height, width, 3).
         balls: Circles (u, v, radius) of the objects in each picture, pixels.
         previous: Previous estimate of the background, the median of all pictures. It is kept where
             the background is never hidden, or hidden in all pictures.

@@ -160,9 +160,9 @@ class BallDetector:
     def __init__(self, background: RgbImage, sigma: float, shadows: bool) -> None:
         """Precompute what every frame is compared with.
 
-        `level` is the difference, in grey levels, from which a pixel counts as changed. `_plain` is
-        the background as floats, `_grey` its brightness, and `_square` its squared length in colour
-        space, at least 1.
+        `level` is the difference, in grey levels, from which a pixel counts as changed.
+        `_float_background` is the background as floats, `_background_brightness` its brightness,
+        and `_background_square` its squared length in colour space, at least 1.
 
         Args:
             background: Scene without the ball.
@@ -175,11 +175,11 @@ class BallDetector:
         self.shadows = shadows
         # With six sigma, none of ten thousand pixels exceeds the threshold by noise alone.
         self.level = max(_MIN_THRESHOLD, 6 * sigma)
-        self._plain = background.astype(np.float32)
+        self._float_background = background.astype(np.float32)
         cv2 = import_package("cv2")
-        self._grey = cv2.cvtColor(background, cv2.COLOR_RGB2GRAY)
-        squares = (self._plain * self._plain).sum(axis=2)
-        self._square = np.maximum(squares, 1.0)
+        self._background_brightness = cv2.cvtColor(background, cv2.COLOR_RGB2GRAY)
+        squares = (self._float_background * self._float_background).sum(axis=2)
+        self._background_square = np.maximum(squares, 1.0)
 
     def detect(self, picture: RgbImage, ghosts: bool = False) -> list[BallDetection]:
         """Detect round objects in a picture, those in the largest regions first.
@@ -195,7 +195,7 @@ class BallDetector:
         cv2 = import_package("cv2")
         difference = self._compute_largest_difference(picture)
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-        brightness = cv2.absdiff(grey, self._grey)
+        brightness = cv2.absdiff(grey, self._background_brightness)
         mask = (difference > self.level).astype(np.uint8)
         if not mask.any():
             return []
@@ -270,6 +270,7 @@ class BallDetector:
             grown_mask = cv2.dilate(region_mask, np.ones((3, 3), np.uint8))
             outer_mask = cv2.dilate(grown_mask, np.ones((5, 5), np.uint8))
             ring = (outer_mask > 0) & (grown_mask == 0) & (mask == 0)
+            # A region without unchanged surroundings has nothing to be compared with.
             if not ring.any():
                 continue
             is_inside = region_mask > 0
@@ -319,10 +320,10 @@ class BallDetector:
         brightness_ratio = np.zeros(mask.shape, np.float32)
         rows, columns = np.nonzero(mask)
         colours = picture[rows, columns].astype(np.float32)
-        background_colours = self._plain[rows, columns]
+        background_colours = self._float_background[rows, columns]
         # Least squares over the three colours.
         product = (colours * background_colours).sum(axis=1)
-        factor = product / self._square[rows, columns]
+        factor = product / self._background_square[rows, columns]
         deviations = np.abs(colours - factor[:, None] * background_colours).max(axis=1)
         # Relative to the lighter of both, where a shadow is missing.
         scaled_deviations = deviations / np.maximum(factor, 1)
@@ -383,6 +384,7 @@ class BallDetector:
         cv2.drawContours(shadow_mask, [contour], -1, 0, -1, offset=offset)
         cv2.drawContours(shadow_mask, [contour], -1, 0, _UNSHADED_RIM_PIXELS, offset=offset)
         windows[:, shadow_mask > 0] = 0
+        # In a few pixels, rays do not find an edge.
         if radius < _MIN_RAY_RADIUS:
             return self._measure_small_ball(windows[1], u - u0, v - v0, radius, u0, v0)
         return self._fit_circle(windows, (u - u0, v - v0, radius), u0, v0)
@@ -462,8 +464,8 @@ class BallDetector:
             radius: Approximate radius, pixels.
 
         Returns:
-            (n, 2) edge points in the window, for the rays with an edge; None if they are less than
-            half of the rays.
+            (n, 2) edge points (u, v) in the window, for the n rays with an edge; None if they are
+            less than half of the rays.
         """
         start = max(0.0, _RAY_SHARES[0] * radius - _RAY_MARGIN)
         end = _RAY_SHARES[1] * radius + _RAY_MARGIN

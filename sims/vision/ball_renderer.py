@@ -206,8 +206,8 @@ class BallScene:
     ) -> None:
         """Render the background once, and create the ball's mesh.
 
-        `_client` is the number of PyBullet's renderer, `_rays` the viewing direction of each pixel,
-        `_background` the scene without the ball, and `_ball` the body of the ball.
+        `_client` is the number of PyBullet's renderer, `_view_directions` the viewing direction of
+        each pixel, `_background` the scene without the ball, and `_ball` the body of the ball.
 
         Args:
             camera: Camera that does not move.
@@ -227,7 +227,7 @@ class BallScene:
         self._move_body(ground, (0, 0, -_HALF_GROUND_THICKNESS))
         width, height = camera.size
         full_window = 0, 0, width, height
-        self._rays = self._compute_view_directions()
+        self._view_directions = self._compute_view_directions()
         picture, coverage = self._render_body(full_window, 1, ground)
         # Frames are rendered without the ground, because it does not change.
         pybullet.removeBody(ground, physicsClientId=self._client)
@@ -308,8 +308,8 @@ class BallScene:
     def _render_background(self, picture: ColourArray, coverage: ColourArray) -> ColourArray:
         """Return the scene without the ball, and store the visible ground points for shadows.
 
-        `_points` (height, width, 3) has the ground point that each pixel shows in m, and `_open`
-        (height, width) whether it shows the ground and not the sky.
+        `_ground_points` (height, width, 3) has the ground point that each pixel shows in m, and
+        `_shows_ground` (height, width) whether it shows the ground and not the sky.
 
         Args:
             picture: (height, width, 3) rendered ground.
@@ -317,14 +317,14 @@ class BallScene:
         """
         # A ray meets the ground at height 0.
         with np.errstate(divide="ignore"):
-            ground_distance = -self.camera.position[2] / self._rays[..., 2]
+            ground_distance = -self.camera.position[2] / self._view_directions[..., 2]
         # Without the second condition, rays above the horizon would meet the ground behind the
         # camera.
         is_ground = (coverage[..., 0] > 0.5) & (ground_distance > 0)
         ray_lengths = np.where(is_ground, ground_distance, 0.0)
-        points = self.camera.position + ray_lengths[..., None] * self._rays
-        self._points = points.astype(np.float32)
-        self._open = is_ground
+        points = self.camera.position + ray_lengths[..., None] * self._view_directions
+        self._ground_points = points.astype(np.float32)
+        self._shows_ground = is_ground
         brightness = self.appearance.compute_ground_brightness(points[..., 0], points[..., 1])
         ground = picture * brightness[..., None]
         sky = 255 * np.array(self.appearance.sky)
@@ -355,7 +355,7 @@ class BallScene:
             return
         left, top, right, bottom = window
         window_slice = np.s_[top:bottom, left:right]
-        offsets = self._points[window_slice] - shadow_centre.astype(np.float32)
+        offsets = self._ground_points[window_slice] - shadow_centre.astype(np.float32)
         # Distance from that line by Pythagoras; rounding may make the square negative.
         light_components = offsets @ light.astype(np.float32)
         squared_distances = (offsets * offsets).sum(axis=-1)
@@ -364,7 +364,7 @@ class BallScene:
         edge_half_width = _MIN_SHADOW_EDGE * self.radius + _SUN_ANGLE * travel
         # 0 outside the shadow, 1 inside, and linear across its edge; the sky has no shadow.
         depth = (self.radius + edge_half_width - distance) / (2 * edge_half_width)
-        shadow = np.clip(depth, 0, 1) * self._open[window_slice]
+        shadow = np.clip(depth, 0, 1) * self._shows_ground[window_slice]
         brightness = 1 - self.appearance.shadow * shadow
         picture[window_slice] *= brightness[..., None].astype(np.float32)
 

@@ -283,8 +283,8 @@ def _compute_median_distance(line: Array, points: Array) -> float:
     """Return the median distance of points from the line fitted to other points.
 
     Args:
-        line: Points (n, 2) that determine the line.
-        points: Points (m, 2).
+        line: Points (n, 2) that determine the line, pixels.
+        points: Points (m, 2) whose distance is measured, pixels.
     """
     middle = line.mean(axis=0)
     # The last principal axis is perpendicular to the line: along it, the points differ least.
@@ -396,7 +396,7 @@ class _FrameCache:
 
     def __init__(self, source: Iterable[tuple[float, RgbImage]]) -> None:
         self._source = source
-        self._kept: list[tuple[float, RgbImage]] | None = None
+        self._cached_frames: list[tuple[float, RgbImage]] | None = None
 
     def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
         """Yield time and picture of each frame, and store the frames in the first full pass.
@@ -404,8 +404,8 @@ class _FrameCache:
         More than `_MAX_CACHED_BYTES` bytes of pictures are not stored, and the film is read again
         in each pass.
         """
-        if self._kept is not None:
-            yield from self._kept
+        if self._cached_frames is not None:
+            yield from self._cached_frames
             return
         frames = []
         stored_bytes = 0
@@ -418,7 +418,7 @@ class _FrameCache:
                 frames.clear()
             yield time, picture
         if stored_bytes <= _MAX_CACHED_BYTES:
-            self._kept = frames
+            self._cached_frames = frames
 
 
 def _format_no_ball_message(frames: int, frames_with_objects: int) -> str:

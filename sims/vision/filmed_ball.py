@@ -112,12 +112,12 @@ class FilmedBall(Simulator):
         """Simulate a film of the ball for each parameter vector; see `Simulator.simulate`.
 
         Args:
-            theta: (n, 1) parameters.
+            theta: (n, dim) parameters: the restitution, then coefficients of effects.
             scenario: times, initial state and constants of the run.
 
         Returns:
-            (n, T, C) observed channels: the height z in m, NaN if films are tracked, and the pixel
-            row v of the ball, NaN where it is not seen.
+            (n, T, C) the C observed channels in T samples: the height z in m, NaN if films are
+            tracked, and the pixel row v of the ball, NaN where it is not seen.
         """
         constants = self.run_constants(scenario)
         self.run_inputs(scenario)  # raises an error if the scenario has inputs

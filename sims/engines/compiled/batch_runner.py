@@ -90,8 +90,8 @@ def _make_arrays(
 
     Args:
         batch: system, initial states, inputs and effects of all elements.
-        hidden: effects with a hidden state in all elements, with their coefficients (K, L, 1). The
-            hidden states become the last coordinates.
+        hidden: effects with a hidden state in all L elements, with their K coefficients (K, L, 1).
+            The hidden states become the last coordinates.
         max_phase: maximum phase of an oscillation per step in radians; see `step_size`.
         patience: maximum number of steps of an element, as a multiple of the planned ones.
     """
@@ -226,7 +226,7 @@ def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple
     hidden state is off, by definition, unless its first coefficient is above zero.
 
     Args:
-        batch: batch of L elements, with the coefficients (K, L, 1) of their effects.
+        batch: batch of L elements, with the K coefficients (K, L, 1) of their effects.
 
     Returns:
         Indices (n,) of each group's elements, and its effects with coefficients (K, L, 1).

@@ -300,7 +300,7 @@ def uses_registers(code: IntTable, count: int) -> bool:
     Calls of external functions are not checked: their arguments are addresses, not registers.
 
     Args:
-        code: (n, 5) instructions: operation, register of the result, registers of arguments.
+        code: (n, 5) n instructions: operation, register of the result, registers of arguments.
         count: number of registers.
     """
     is_external = code[:, 0] == EXTERNAL

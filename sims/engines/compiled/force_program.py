@@ -175,7 +175,8 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
     ) -> tuple[Evaluator, Evaluator]:
         """Return the functions that evaluate forces and impacts for these L elements.
 
-        Shapes: L elements, d coordinates, of which the last ones are hidden states of effects.
+        Shapes: L elements, d coordinates, of which the last ones are hidden states of effects, U
+        inputs, P parameters.
 
         Args:
             t: (L, 1) time since the start of the run, s.
@@ -196,6 +197,8 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
 
         def evaluate_forces() -> tuple[Any, Any]:
             """Return the generalised force (L, d), and the limit (L, 1) of dry friction.
+
+            Shapes: L elements, d coordinates.
 
             The rate r of a hidden state is returned as the force M' r, because the engine divides
             all forces by the inertia M' of the system's own coordinates.
@@ -249,9 +252,9 @@ def compute_own_inertia(
 
     Args:
         system: the system.
-        theta: (L, p) its parameters.
+        theta: (L, p) its p parameters in L batch elements.
         constants: (L, 1) constants by name.
-        acting: effects with their coefficients (K, L, 1).
+        acting: effects with their K coefficients (K, L, 1).
     """
     remaining_share: Any = 1.0
     for effect, c in acting:
@@ -268,7 +271,7 @@ def _count_hidden_states(effects: Sequence[Effect]) -> int:
 def _make_samples(
     batch: IntegrationBatch, first: Indices, effects: Sequence[Effect]
 ) -> list[Array]:
-    """Return inputs (n, 1) of a program at the initial state of an element, and at a shifted one.
+    """Return the n inputs (n, 1) of a program at an element's initial state, and at a shifted one.
 
     Hidden states are zero at the first. A traced program is compared with NumPy at both.
 

@@ -64,10 +64,10 @@ def make_instruction_runner(
     Machine code does not check array bounds, so the instructions are checked once, here.
 
     Args:
-        code: (n, 5) instructions; see `ProgramArrays`.
+        code: (n, 5) n instructions; see `ProgramArrays`.
         first: index of the first instruction.
         last: index after the last instruction.
-        r: (registers, W) registers.
+        r: (registers, W) registers of W slots.
 
     Returns:
         The function without arguments.

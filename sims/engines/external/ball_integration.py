@@ -78,7 +78,7 @@ def make_trajectory(element: ElementWork, rows: list[tuple[float, ...]]) -> Traj
         rows: position, velocity and acceleration, nine numbers for each recorded state.
 
     Returns:
-        Positions, velocities and accelerations (N, 3).
+        Positions, velocities and accelerations (N, 3) in N recorded states.
     """
     if len(rows) < element.recorded_steps.size:
         rows = [(math.nan,) * 9] * element.recorded_steps.size
@@ -151,7 +151,8 @@ def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
         element: Batch element: initial state, steps, constants and effects.
 
     Returns:
-        Positions, velocities and accelerations (N, 3); NaN if the integration failed.
+        Positions, velocities and accelerations (N, 3) in N recorded states; NaN if the integration
+        failed.
     """
     ball.reset_world(element.plain_constants)
     rollout = BallRollout(ball, element)
@@ -161,6 +162,7 @@ def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
         rollout.advance(step)
         if number in recorded_steps:
             recorded_states.append(rollout.state)
+            # The missing states make the whole trajectory NaN.
             if not math.isfinite(sum(rollout.state)):
                 break
     return make_trajectory(element, recorded_states)
@@ -237,6 +239,7 @@ class BallRollout:
             if time_to_impact > _NO_TIME:
                 part = min(time_to_impact, remaining)
                 self._advance_without_impact(part)
+            # No impact is left in the step, which is finished.
             if time_to_impact >= remaining:
                 return
             remaining -= time_to_impact
@@ -401,7 +404,8 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
         element: Batch element: initial state, steps, constants and effects.
 
     Returns:
-        Positions, velocities and accelerations (N, 3); NaN if the integration failed.
+        Positions, velocities and accelerations (N, 3) in N recorded states; NaN if the integration
+        failed.
     """
     # Unlike in `BallRollout`, velocity and contact of the engine are used without correction.
     forces = ElementForces(element, 1)
@@ -445,6 +449,7 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
         t += step
         if number in recorded_steps:
             recorded_states.append((*x, *w, *compute_force(t, x, w)))
+            # The missing states make the whole trajectory NaN.
             if not math.isfinite(sum(recorded_states[-1])):
                 break
     # The engine reports no acceleration: it is computed from the effects' forces.

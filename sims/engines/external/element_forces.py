@@ -52,13 +52,18 @@ class ElementForces:
         r[rows[IN_P] : rows[IN_E]] = element.parameters[:, None]
         compute_constants, self._run_moment, self._run_impact = prepared.make_runners()
         # Single numbers are read and written much faster by a memory view than by an array.
-        self._numbers = memoryview(r.data).cast("B").cast("d")
+        self._memory = memoryview(r.data).cast("B").cast("d")
         offsets = (rows * states).tolist()
-        self._t, self._x, self._v, self._u = (offsets[k] for k in (IN_T, IN_X, IN_V, IN_U))
-        self._e, self._mu, self._speed = (offsets[k] for k in (IN_E, IN_MU, IN_SPEED))
-        self._force = (layout.out * states).tolist()
-        self._limit = offsets[OUT_LIMIT] if flags[HAS_FRICTION] else None
-        self._impact = offsets[OUT_E], offsets[OUT_MU]
+        # Time, position, velocity and inputs.
+        self._t_offset, self._x_offset = offsets[IN_T], offsets[IN_X]
+        self._v_offset, self._u_offset = offsets[IN_V], offsets[IN_U]
+        # Restitution and friction without effects, and speed of an impact.
+        self._e_offset, self._mu_offset = offsets[IN_E], offsets[IN_MU]
+        self._speed_offset = offsets[IN_SPEED]
+        # Results: force, limit of dry friction, restitution and friction with effects.
+        self._force_offsets = (layout.out * states).tolist()
+        self._limit_offset = offsets[OUT_LIMIT] if flags[HAS_FRICTION] else None
+        self._impact_offsets = offsets[OUT_E], offsets[OUT_MU]
         self._states = states
         self._signals = [values[0].tolist() for values in element.inputs.values()]
         self._restitution = (
@@ -81,7 +86,7 @@ class ElementForces:
             if step == 0 or values[step] != values[step - 1]:
                 has_changed = True
                 for state in range(self._states):
-                    self._numbers[self._u + k * self._states + state] = values[step]
+                    self._memory[self._u_offset + k * self._states + state] = values[step]
         return has_changed
 
     def evaluate_at_velocities(
@@ -96,13 +101,13 @@ class ElementForces:
             x: position.
             velocities: the two velocities.
         """
-        numbers = self._numbers
+        numbers = self._memory
         # Each register has two numbers, one for each velocity.
-        numbers[self._t] = numbers[self._t + 1] = t
-        numbers[self._x] = numbers[self._x + 1] = x
-        numbers[self._v], numbers[self._v + 1] = velocities
+        numbers[self._t_offset] = numbers[self._t_offset + 1] = t
+        numbers[self._x_offset] = numbers[self._x_offset + 1] = x
+        numbers[self._v_offset], numbers[self._v_offset + 1] = velocities
         self._run_moment()
-        force = self._force[0]
+        force = self._force_offsets[0]
         return numbers[force], numbers[force + 1]
 
     def evaluate(self, t: float, x: Vector, v: Vector) -> tuple[float, float, float]:
@@ -115,12 +120,15 @@ class ElementForces:
             x: position.
             v: velocity.
         """
-        numbers = self._numbers
-        numbers[self._t] = t
-        numbers[self._x], numbers[self._x + 1], numbers[self._x + 2] = x
-        numbers[self._v], numbers[self._v + 1], numbers[self._v + 2] = vx, vy, vz = v
+        numbers = self._memory
+        numbers[self._t_offset] = t
+        # There is one state, so that the three coordinates are in consecutive places.
+        x_offset, v_offset = self._x_offset, self._v_offset
+        numbers[x_offset], numbers[x_offset + 1], numbers[x_offset + 2] = x
+        vx, vy, vz = v
+        numbers[v_offset], numbers[v_offset + 1], numbers[v_offset + 2] = vx, vy, vz
         self._run_moment()
-        fx, fy, fz = (numbers[k] for k in self._force)
+        fx, fy, fz = (numbers[k] for k in self._force_offsets)
         limit = self.limit
         speed = math.sqrt(vx * vx + vy * vy + vz * vz) if limit else 0.0
         # Dry friction has no direction at rest.
@@ -130,15 +138,17 @@ class ElementForces:
     @property
     def limit(self) -> float:
         """Limit of dry friction at the first state of the last evaluation."""
-        return 0.0 if self._limit is None else self._numbers[self._limit]
+        return 0.0 if self._limit_offset is None else self._memory[self._limit_offset]
 
     def compute_impact(self, speed: float) -> tuple[float, float]:
         """Return restitution and friction coefficient of an impact at this speed (m/s).
 
-        The compiled program reads its inputs from `_numbers`, and writes its results there.
+        The compiled program reads its inputs from `_memory`, and writes its results there.
         """
-        numbers = self._numbers
-        numbers[self._e], numbers[self._mu], numbers[self._speed] = self._restitution, 0.0, speed
+        numbers = self._memory
+        numbers[self._e_offset] = self._restitution
+        numbers[self._mu_offset] = 0.0
+        numbers[self._speed_offset] = speed
         self._run_impact()
-        e, mu = self._impact
+        e, mu = self._impact_offsets
         return numbers[e], numbers[mu]

@@ -226,6 +226,7 @@ def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
             joint.set_state(x, w)
             step = h
         x, w = joint.advance((start - w) * inertia / h)  # (4), (2)
+        # The missing records make the whole trajectory NaN, see below.
         if not math.isfinite(x + w):
             break
         t += h

@@ -67,7 +67,7 @@ class MujocoMover:
         self._no_contact = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         # Width, midpoint and power of the impedance are MuJoCo's defaults.
         self._model.geom_solimp[:] = _CONTACT_IMPEDANCE, _CONTACT_IMPEDANCE, 1e-3, 0.5, 2.0
-        self._step = mujoco.mj_step
+        self._step_world = mujoco.mj_step
         self._inverse_step = math.nan
         self._set_contact(False)
 
@@ -101,7 +101,7 @@ class MujocoMover:
         """Advance by one step with a force per unit mass at the centre."""
         mass = self._mass
         self._force[:] = mass * force[0], mass * force[1], mass * force[2]
-        self._step(self._model, self._data)
+        self._step_world(self._model, self._data)
         self._force[:] = 0.0
         return self._x.tolist(), self._w.tolist()
 

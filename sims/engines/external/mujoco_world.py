@@ -94,7 +94,7 @@ class MujocoJoint:
         self._x = self._data.qpos
         self._w = self._data.qvel
         self._force = self._data.qfrc_applied
-        self._step = import_mujoco().mj_step
+        self._step_world = import_mujoco().mj_step
 
     def set_step(self, step: float, inertia: float) -> None:
         """Set step (s) and inertia (kg or kg*m^2)."""
@@ -114,7 +114,7 @@ class MujocoJoint:
     def advance(self, force: float) -> tuple[float, float]:
         """Advance by one step; return position and velocity."""
         self._force[0] = force
-        self._step(self._model, self._data)
+        self._step_world(self._model, self._data)
         return self._x.item(), self._w.item()
 
     def __getstate__(self) -> dict[str, Any]:

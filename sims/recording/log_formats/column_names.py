@@ -79,7 +79,7 @@ def name_list_entries(
     into columns such as ``position.elbow``; the names are looked up in each row.
 
     Args:
-        columns: Numbers (T,) or (T, k) by column name.
+        columns: Numbers (T,), or (T, k) for lists of k numbers, by column name.
         texts: Texts (T,) by column name.
 
     Returns:
@@ -113,7 +113,7 @@ def name_array_entries(
     ``position.elbow``.
 
     Args:
-        columns: Numbers (T,) or (T, k) by array name.
+        columns: Numbers (T,), or (T, k) for arrays with k columns, by array name.
         names: Texts (k,) by array name.
 
     Returns:
@@ -163,7 +163,7 @@ def _sort_by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) ->
     """Sort numbers into columns by name, looking up the names in each row.
 
     Args:
-        values: Numbers (T, k).
+        values: Numbers (T, k), k in each of T rows.
         names: Names (k, T), one for each number in each row; some may be empty.
         prefix: Beginning of the names of the new columns.
 

@@ -26,7 +26,8 @@ def read_numeric_columns(table: Any) -> tuple[dict[str, Array], list[str]]:
         table: Table of pyarrow.
 
     Returns:
-        Numbers by column name, (T,) or (T, k), and the names of the columns without numbers.
+        Numbers by column name, (T,), or (T, k) for lists of k numbers; and the names of the columns
+        without numbers.
     """
     columns: dict[str, Array] = {}
     texts = []
@@ -145,8 +146,8 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
         group: Path of the group in it.
 
     Returns:
-        Numbers by the path of their dataset in the group, (T,) or (T, k); and the texts of each
-        other dataset, empty where it holds neither numbers nor a list of texts.
+        Numbers by the path of their dataset in the group, (T,), or (T, k) with k columns; and the
+        texts of each other dataset, empty where it holds neither numbers nor a list of texts.
 
     Raises:
         InputError: There is no such group, or the file cannot be read.

@@ -87,7 +87,8 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
         episode: Number of the episode.
 
     Returns:
-        Numeric columns by name, (T,) or (T, k), and the names of the columns without numbers.
+        Numeric columns by name, (T,), or (T, k) for lists of k numbers; and the names of the
+        columns without numbers.
 
     Raises:
         InputError: There is no such episode, or a file cannot be read.

@@ -192,7 +192,7 @@ def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list
 
     Args:
         path: the file.
-        columns: numbers (T,) or (T, k) by the name of their array.
+        columns: numbers (T,), or (T, k) with k columns, by the name of their array.
         texts: lists of texts by the name of their array, empty for arrays of another type. A list
             with as many texts as a matrix has columns, such as joint names, names these columns.
 

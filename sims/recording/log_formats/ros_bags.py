@@ -155,10 +155,10 @@ class MessageTable:
         Args:
             wanted_names: Names of the numbers to store, in any case; all if empty.
         """
-        self._wanted = {name.strip().lower() for name in wanted_names}
-        if self._wanted:
+        self._wanted_names = {name.strip().lower() for name in wanted_names}
+        if self._wanted_names:
             # A column named run may number the runs of the log.
-            self._wanted.add("run")
+            self._wanted_names.add("run")
         self._stamps = array("d")
         self._written = array("d")
         self._numbers: dict[str, array[float]] = {}
@@ -176,7 +176,7 @@ class MessageTable:
         self._stamps.append(_get_stamp(message))
         self._written.append(_SECONDS_PER_NANOSECOND * written)
         for name, value in _iterate_numbers("", message, 0):
-            if self._wanted and name.lower() not in self._wanted:
+            if self._wanted_names and name.lower() not in self._wanted_names:
                 continue
             column = self._numbers.setdefault(name, array("d"))
             # Earlier messages may have lacked this number.

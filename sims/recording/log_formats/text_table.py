@@ -639,7 +639,7 @@ class _TextColumn:
             file_has_decimal_commas: Whether some column of the file has decimal commas.
 
         Returns:
-            Numbers (T,) or (T, k); None if the column holds text.
+            Numbers (T,), or (T, k) for lists of k numbers; None if the column holds text.
 
         Raises:
             InputError: A cell is not a number, or its comma is ambiguous.
@@ -651,6 +651,7 @@ class _TextColumn:
         first = self.filled.iloc[0]
         if first.lower() in BOOLEAN_VALUES:
             switches = self.series.str.lower().map({**BOOLEAN_VALUES, "": np.nan})
+            # With any other cell, the column is text, or has a wrong cell, which is found below.
             if bool(((self.series == "") | switches.notna()).all()):
                 return np.asarray(switches, dtype=np.float64)
         if NUMBERS.fullmatch(first) and is_numeric(first):

@@ -104,8 +104,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
     """Read the tensors of a PyTorch file, and its lists of texts.
 
     Returns:
-        Tensors by name, (T,) or (T, k), and the texts of each other entry, empty where it holds
-        something else.
+        Tensors of one or two dimensions by name, (T,) or (T, k), and the texts of each other entry,
+        empty where it holds something else.
 
     Raises:
         InputError: The file is not a PyTorch archive; the message is one line.
@@ -132,7 +132,7 @@ def _read_tensors(
 
     Returns:
         Tensors by name, (T,) or (T, k), and the texts of each other entry, empty where it holds
-        something else.
+        something else, such as a tensor of more dimensions.
 
     Raises:
         InputError: the archive has no single pickle program, or one that is too large.
@@ -213,6 +213,7 @@ def _read_storage(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Te
     if np.prod(tensor.size, dtype=np.float64) > MAX_ENTRIES:
         raise InputError(f"{path}: a tensor has more than {MAX_ENTRIES} entries")
     member_name = f"{folder}data/{tensor.storage.key}"
+    # A number has at most 8 bytes.
     if archive.getinfo(member_name).file_size > 8 * MAX_ENTRIES:
         raise InputError(f"{path}: {member_name} is too large for a log of tensors")
     stored_numbers = np.frombuffer(archive.read(member_name), dtype=number_type)
