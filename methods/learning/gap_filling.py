@@ -83,7 +83,7 @@ def _fit_camera_line(design_matrix: Array, values: Array) -> Array:
         values: (n,) pixel rows y.
 
     Returns:
-        (3,) numbers a, b and c, eq. (2) of the module.
+        (3,) numbers a, b and c.
     """
     weights: Array = np.ones(len(design_matrix))
     coefficients: Array = np.zeros(3)
@@ -94,7 +94,7 @@ def _fit_camera_line(design_matrix: Array, values: Array) -> Array:
         coefficients = solution.astype(np.float64)
         residual: Array = values - design_matrix @ coefficients
         width = max(_CAUCHY_WIDTH * float(np.median(np.abs(residual))), _MIN_CAUCHY_WIDTH)
-        # This is the root of Cauchy's weight, because it multiplies both sides of (2).
+        # This is the root of Cauchy's weight, because it multiplies both sides of the equation.
         weights = 1 / np.sqrt(1 + (residual / width) ** 2)
     return coefficients
 

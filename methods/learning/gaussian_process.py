@@ -178,14 +178,22 @@ class GaussianProcess:
         return float(value), np.append(by_length, by_noise)
 
     def predict(self, points: Array) -> Array:
-        """Compute the posterior mean (m,) of the function at points (m, dim), eq. (2.25)."""
+        """Compute the posterior mean (m,) of the function at points (m, dim).
+
+        It is mean + k alpha (2.25), with the correlations k (m, n) of the points with the n known
+        ones, and alpha = K^-1 (values - mean).
+        """
         squares = (points[:, None] - self.points) ** 2
         k, _ = self._compute_correlation(squares)
         mean: Array = self.mean + k @ self._alpha  # (2.25)
         return mean
 
     def sample(self, points: Array, draws: int, rng: np.random.Generator) -> Array:
-        """Draw joint samples of the posterior by a Cholesky factor of its covariance (2.26).
+        """Draw joint samples of the posterior by a Cholesky factor of its covariance.
+
+        The covariance, relative to the variance, is k2 - k K^-1 k' (2.26), and the mean is mean + k
+        alpha (2.25). k are the correlations of the m points with the n known ones, k2 those among
+        the m points, K those among the known ones, and alpha = K^-1 (values - mean).
 
         Args:
             points: (m, dim) m points of the unit cube.

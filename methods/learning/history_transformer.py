@@ -105,12 +105,15 @@ def get_weight_shapes(
         design: design of the network.
     """
     d, width = design.seen, design.width
+    # A token has three vectors of d projected numbers (direction of the difference, target, slope),
+    # the size of the difference, and two vectors of dim numbers (parameters, step).
     layers = {"first": (d, width), "token": (3 * d + 1 + 2 * dim, width)}
     for block in range(design.blocks):
         layers[f"heard{block}"] = width, 3 * width
         for part in ("mixed", "inner", "outer"):
             layers[f"{part}{block}"] = width, width
     layers["guess"] = width, dim
+    # A proposal itself, or for each parameter d gains and an offset, see `predict_proposals`.
     layers["next"] = width, dim if design.published else dim * (d + 1)
     # The projection has no bias, because a bias would cancel in every difference.
     shapes_by_name: dict[str, tuple[int, ...]] = {"seen.weight": (inputs, d)}

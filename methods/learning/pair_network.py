@@ -213,7 +213,12 @@ def train_pair_network(
         return INITIAL_WEIGHT_LIMIT if name.endswith("weight") else 0.0
 
     def fit(weights: Weights, generator: Any) -> None:
-        """Minimise the loss; the weights are changed in place."""
+        """Minimise the loss; the weights are changed in place.
+
+        Args:
+            weights: initial weights by name, tensors of torch.
+            generator: random generator of torch for the order of the samples.
+        """
         proposed_rows, target_rows, y = _convert_to_tensors(rows, parameters)
         loss = _make_loss(design, weights, alone)
         monitor = None

@@ -192,7 +192,7 @@ def _compute_input_rows(
 def _fill_target_gaps(task: Task, simulated: Array, network: TrainedPairNetwork) -> Array:
     """Fill the gaps of the target (T, C) from a simulation (T, C), run by run.
 
-    This is done only if one channel is compared.
+    This is done only if the network reads one channel of the simulation.
 
     Shapes: T samples, C channels.
 
@@ -201,6 +201,7 @@ def _fill_target_gaps(task: Task, simulated: Array, network: TrainedPairNetwork)
         simulated: (T, C) a simulation.
         network: network, with the channels that it compares.
     """
+    # Simulation and target may have different channels, such as a position and its pixels.
     sensor = network.proposed.reading.select_channels(simulated)
     filled = task.observed.copy()
     # With several channels of the simulation, the one that belongs to the sensor is not known.

@@ -41,6 +41,9 @@ class PosteriorRounds:
         `_trainer` and `_posterior` are objects of sbi. `_components` (N, P) are the P principal
         components of the N residuals, `_residual_mean` (N,) their mean, `_component_spread` (P,)
         the spread along each component.
+
+        Args:
+            task: task of the target.
         """
         self.mean: Array | None = None
         self._task = task

@@ -114,6 +114,8 @@ class CMAES(Tuner):
             strategy: strategy of pycma.
             dim: number of parameters of the simulation.
         """
+        # pycma calls the mean its favourite. It may have one more coordinate, which the simulation
+        # ignores.
         mean: Array = np.clip(strategy.result.xfavorite[:dim], 0.0, 1.0)
         return mean
 

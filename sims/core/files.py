@@ -234,6 +234,7 @@ def atomic_new_folder(folder: Path) -> Iterator[Path]:
         yield partial
         partial.replace(folder)
     finally:
+        # After a success there is no temporary folder to delete.
         shutil.rmtree(partial, ignore_errors=True)
 
 

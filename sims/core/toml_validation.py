@@ -155,6 +155,9 @@ def check_table(source: Source, where: str, value: Any, words: str = "") -> dict
         where: Entry of the value.
         value: Value from the file.
         words: Description of the expected value; the default one if empty.
+
+    Raises:
+        InputError: The value is not a table.
     """
     return dict(check_type(source, where, value, dict, words))
 
@@ -184,6 +187,9 @@ def check_text(
         value: Value from the file.
         words: Description of the expected value; the default one if empty.
         max_length: Maximum number of characters.
+
+    Raises:
+        InputError: The value is not a text, or is too long.
     """
     text = str(check_type(source, where, value, str, words))
     if len(text) > max_length:
@@ -201,6 +207,9 @@ def check_name_list(
         where: Entry of the value.
         value: Value from the file.
         words: Description of the expected value.
+
+    Raises:
+        InputError: The value is something else.
     """
     if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
         raise make_error(source, where, words, value)
@@ -215,6 +224,9 @@ def check_number(source: Source, where: str, value: Any, words: str = "") -> flo
         where: Entry of the value.
         value: Value from the file.
         words: Description of the expected value; the default one if empty.
+
+    Raises:
+        InputError: The value is not a number.
     """
     try:
         return float(check_type(source, where, value, float, words))
@@ -230,6 +242,9 @@ def check_finite(source: Source, where: str, value: Any, words: str = "") -> flo
         where: Entry of the value.
         value: Value from the file.
         words: Description of the expected value; the default one if empty.
+
+    Raises:
+        InputError: The value is not a finite number, or is too large.
     """
     result = check_number(source, where, value, words)
     if not math.isfinite(result):
@@ -252,6 +267,9 @@ def check_number_list(
         value: Value from the file.
         count: Required number of entries.
         words: Description of the expected value; the default one if empty.
+
+    Raises:
+        InputError: The value is something else.
     """
     if not isinstance(value, list | tuple) or len(value) != count:
         raise make_error(source, where, words or f"{count} numbers", value)
@@ -265,6 +283,9 @@ def check_number_pair(source: Source, where: str, value: Any) -> Range:
         source: File or name with which the message begins.
         where: Entry of the value.
         value: Value from the file.
+
+    Raises:
+        InputError: The value is something else.
     """
     low, high = check_number_list(source, where, value, 2, "[low, high]")
     return low, high
@@ -277,6 +298,9 @@ def check_range(source: Source, where: str, value: Any) -> Range:
         source: File or name with which the message begins.
         where: Entry of the value.
         value: Value from the file.
+
+    Raises:
+        InputError: The value is something else.
     """
     low, high = check_number_pair(source, where, value)
     if not low < high:

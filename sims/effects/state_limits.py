@@ -229,6 +229,8 @@ def _convert_to_level_size(c: Coefficient, unit: str, scale: float) -> Coefficie
         unit: unit of the level.
         scale: typical size of the level, in this unit.
     """
+    # The range is relative to the level's size. Units and ranges are stated for each of the three
+    # kinds of system, which are the same for a level.
     low, high = c.plausible[0]
     return replace(c, units=(unit,) * 3, plausible=((low * scale, high * scale),) * 3)
 
@@ -250,6 +252,7 @@ def find_level_effect(name: str, system: type[System]) -> type[Effect] | None:
     try:
         effect = registry.get(effect_name)
     except PartUnavailableError:
+        # The effect is registered, but cannot be used on this machine.
         return None
     if not issubclass(effect, Level) or not system.levels:
         return None

@@ -504,7 +504,7 @@ def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
         InputError: a part would have too few samples.
     """
     count = len(run.times)
-    split_index = (2 * count) // _HELD_OUT_STRIDE
+    split_index = (2 * count) // 3
     parts = (
         replace(run.part(slice(split_index)), held_out=False),
         replace(run.part(slice(split_index, None)), held_out=True),

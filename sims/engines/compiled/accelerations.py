@@ -191,6 +191,7 @@ def compute_acceleration(block: Block, row_of_result: int, friction_row: int) ->
     if block.flags[HAS_FRICTION] == 0:
         compute_frictionless_acceleration(block, row_of_result)
         return
+    # The faster version does not know the ground, which may support an element.
     if block.flags[FRICTION_COORDINATE_COUNT] == 1 and block.flags[BOUNCES] == 0:
         compute_acceleration_1d(block, row_of_result, friction_row)
         return

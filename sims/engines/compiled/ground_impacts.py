@@ -88,6 +88,7 @@ def is_newly_loaded(block: Block, i: int) -> bool:
         i: index of the slot.
     """
     n = block.n
+    # An order index of -1 marks a slot that is not used.
     return bool(n[ORDER_INDEX, i] >= 0 and n[STEP_INDEX, i] == 0 and n[IS_STEP_START, i] == 1)
 
 

@@ -233,8 +233,9 @@ def update_max_slope(block: Block, k: int, register: int, row_of_result: int) ->
             among them, in `block.r[REGISTER, i]`.
         k: index of the coordinate.
         register: first register of the positions or velocities.
-        row_of_result: MAX_ACCELERATION for positions, or MAX_FRICTION for velocities. The row
-            stays unchanged where it is larger than the slope.
+        row_of_result: MAX_ACCELERATION for positions, or MAX_FRICTION for velocities: rows that
+            hold slopes here, since they are free before the integration begins. The row stays
+            unchanged where it is larger than the slope.
     """
     a = block.a
     if row_of_result == MAX_FRICTION:

@@ -177,8 +177,11 @@ def _make_element(
         recorded_steps: numbers of the steps after which the state is recorded.
     """
     element = batch.select(np.array([i]))
+    # Effects whose coefficients are all zero do nothing.
     effects = tuple((effect, c) for effect, c in element.effects if c.any())
+    # The force program computes these; the other effects are applied elsewhere.
     forces = [(e, c) for e, c in effects if isinstance(e, Force | Friction | Contact)]
+    # The parameters of the program: those of the system, its constants, then coefficients.
     numbers = [element.theta[0], *(value[0] for value in element.constants.values())]
     # An element without any step of positive length still has an input at its single time.
     input_steps = moving if moving.size else slice(1)

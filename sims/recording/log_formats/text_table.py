@@ -335,6 +335,7 @@ def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple
     cells = tuple(cell.strip() for cell in rows[first])
     numbers = cells[1:] if cells and not cells[0] else cells
     counts = [tuple(str(start + k) for k in range(len(numbers))) for start in (0, 1)]
+    # One or two cells may be such numbers by chance.
     if len(numbers) < 3 or numbers not in counts:
         return ()
     # A first row 0, 1, 2, ... may also be data, unless the following rows contain fractions.
