@@ -38,8 +38,8 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
     """Fill the gaps of a sensor's channel from a simulation, through a fitted map between them.
 
     The map is y = (a + b x) / (1 + c x), as a camera maps a line (1). Its three numbers are fitted
-    to the available samples in linear form (2) and with Cauchy's weights, because an inaccurate
-    model agrees with the sensor only in parts of a run.
+    to the available samples in the linear form y = a + b x - c x y (2), and with Cauchy's weights,
+    because an inaccurate model agrees with the sensor only in parts of a run.
 
     Args:
         channel: (T,) channel with NaN for missing samples.

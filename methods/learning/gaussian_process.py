@@ -94,8 +94,9 @@ class GaussianProcess:
     ) -> tuple[Array, Array]:
         """Compute the correlation of pairs, and its derivative by their scaled squared distance.
 
-        The scaled squared distance is the sum over the coordinates of squared difference by squared
-        length scale.
+        The scaled squared distance r^2 is the sum over the coordinates of squared difference by
+        squared length scale. The correlation is exp(-r^2 / 2) (4.9), or with the Matérn kernel
+        (1 + q + q^2 / 3) exp(-q), q = sqrt(5) r (4.17).
 
         Args:
             squares: (n, m, dim) squared differences of the pairs of n and m points.

@@ -59,7 +59,8 @@ class TrainedPairNetwork:
             design: design of the network.
             data: training data.
             rng: random generator.
-            reading: configuration of the inputs.
+            reading: configuration of the inputs; its `proposed` is that of the proposed side if it
+                differs, otherwise None.
             alone: True to learn the parameters from the target's side alone (direct regression).
             monitor: monitor of the training; None for none.
         """

@@ -103,6 +103,7 @@ class CMAES(Tuner):
         }
         if population is not None:
             options["popsize"] = population
+        # pycma refuses a single parameter; the simulation ignores the second coordinate.
         padded = centre if len(centre) > 1 else np.append(centre, 0.5)
         return cma.CMAEvolutionStrategy(padded, self.sigma, options)
 

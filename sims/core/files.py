@@ -204,6 +204,7 @@ def _rename_if_free(partial: Path, path: Path) -> None:
         # Unlike a rename, this fails if the file was created in the meantime.
         os.link(partial, path)
     except FileExistsError:
+        # It is an OSError too, but means that the name is taken.
         raise
     except OSError:  # a file system without hard links
         if path.exists():

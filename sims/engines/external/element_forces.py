@@ -64,8 +64,9 @@ class ElementForces:
         self._force_offsets = (layout.out * states).tolist()
         self._limit_offset = offsets[OUT_LIMIT] if flags[HAS_FRICTION] else None
         self._impact_offsets = offsets[OUT_E], offsets[OUT_MU]
-        self._states = states
-        self._signals = [values[0].tolist() for values in element.inputs.values()]
+        self._state_count = states
+        # For each input a list of its values, one per step.
+        self._input_values = [values[0].tolist() for values in element.inputs.values()]
         self._restitution = (
             float(element.system.restitution(element.theta)[0, 0]) if flags[BOUNCES] else 0.0
         )
@@ -82,11 +83,12 @@ class ElementForces:
             step: Index of the step.
         """
         has_changed = step == 0
-        for k, values in enumerate(self._signals):
+        for k, values in enumerate(self._input_values):
             if step == 0 or values[step] != values[step - 1]:
                 has_changed = True
-                for state in range(self._states):
-                    self._memory[self._u_offset + k * self._states + state] = values[step]
+                # The input is the same for all states.
+                for state in range(self._state_count):
+                    self._memory[self._u_offset + k * self._state_count + state] = values[step]
         return has_changed
 
     def evaluate_at_velocities(

@@ -335,7 +335,7 @@ def _make_column_numbers(rows: Mapping[int, Sequence[str]], first: int) -> tuple
     cells = tuple(cell.strip() for cell in rows[first])
     numbers = cells[1:] if cells and not cells[0] else cells
     counts = [tuple(str(start + k) for k in range(len(numbers))) for start in (0, 1)]
-    # One or two cells may be such numbers by chance.
+    # One or two cells of data may well be such numbers.
     if len(numbers) < 3 or numbers not in counts:
         return ()
     # A first row 0, 1, 2, ... may also be data, unless the following rows contain fractions.
@@ -460,7 +460,7 @@ def _read_cells(layout: Layout) -> list[Any]:
             return [np.array([], dtype=object)] * layout.width
         except (pandas.errors.ParserError, ValueError) as error:
             raise _find_uneven_row(layout) or _make_split_error(layout, error) from None
-    else:
+    else:  # neither encoding fits
         raise InputError(f"{layout.path}: expected UTF-8 text; save it as UTF-8")
     is_comment = table[0].str.match(COMMENT.pattern)
     if is_comment.any():
