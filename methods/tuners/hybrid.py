@@ -77,7 +77,6 @@ class TuneNetLeastSquares(TuneNet):
         """
         finish = LeastSquares(reproduced=_ROUNDING_LOSS)
         run = EvaluationHistory(task, _ROUNDING_LOSS)
-        loss_tolerance = run.enough / _ROUNDING_LOSS * finish.reproduced
         is_trusted = yield from self._take_network_steps(run, task)
         # Without any successful simulation, the middle of the training range is the start.
         if not np.isfinite(run.losses).any():
@@ -90,10 +89,10 @@ class TuneNetLeastSquares(TuneNet):
             model = yield from self._build_linear_model(run, finish)
             model.trusted = is_trusted
             yield from fit.fit_from_model(run, model)
-            if min(run.losses) <= loss_tolerance:
+            if min(run.losses) <= run.enough:
                 break
             is_trusted = False
-        while min(run.losses) > loss_tolerance:
+        while min(run.losses) > run.enough:
             yield from finish.fit_from_point(run, run.find_untried_point(rng))
         return "the simulation reproduces the target"
 
