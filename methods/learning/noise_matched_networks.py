@@ -332,7 +332,7 @@ class NoiseMatchedTuner(Tuner, Generic[Learner]):
         Args:
             data: training data.
             rng: random generator.
-            held_out: held-out data for the losses that `callback` gets; None for none.
+            held_out: held-out data for the losses that the callback `watch` gets; None for none.
             training_range: (2, dim) corners of the training range.
         """
         callback = self.watch

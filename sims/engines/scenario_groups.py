@@ -39,6 +39,7 @@ class ScenarioGroups:
 
         Equal rows that share memory are broadcast.
         """
+        # Rows that are the same memory have a stride of zero.
         if len(rows) == 1 or rows.strides[0] == 0:
             rows = rows[:1]
             return np.broadcast_to(rows, (self.scenario_index.size, *rows.shape[1:]))
