@@ -98,21 +98,22 @@ def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterato
     assert issubclass(kind, RobotSimulator)
     # 1. Converged motion.
     motions = _ReferenceMotions(evaluator, noise)
+    # Time step and integrator of the model file.
     model_settings = kind.numerics
-    reference = motions.reference(model_settings)
+    reference = motions.find_converged_motion(model_settings)
     if reference is None:
         return
     # 2. Error of the settings of the model file.
-    error = motions.compute_rms_difference(motions.of(model_settings), reference)
+    error = motions.compute_rms_difference(motions.get_motion(model_settings), reference)
     if not error > MIN_DISCRETISATION_ERROR:
         return
-    # 3. Settings with a small error. A larger one is also tried, for models with a large residual
+    # 3. Settings with a small error. One that reduces the error clearly, but leaves more of it, is
+    # also yielded: the caller accepts it for a model with a large residual
     # (`StepRefinement.is_accurate_enough`).
-    max_error = max(
-        MAX_CORRECTED_ERROR, min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
-    )
+    clearly_reduced_error = min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
+    max_error = max(MAX_CORRECTED_ERROR, clearly_reduced_error)
     for numerics in _iterate_settings(model_settings):
-        corrected_error = motions.compute_rms_difference(motions.of(numerics), reference)
+        corrected_error = motions.compute_rms_difference(motions.get_motion(numerics), reference)
         if corrected_error < max_error:
             yield StepRefinement(
                 kind=kind.with_integrator_settings(numerics),
@@ -134,10 +135,13 @@ def _iterate_settings(model_settings: IntegratorSettings) -> Iterator[Integrator
     """
     step, integrator, *_ = model_settings
     relative_costs = {"RK4": RELATIVE_RK4_COST}
+    # `dict.fromkeys` removes a repeated name and keeps the order.
+    integrators = dict.fromkeys((integrator, STIFF_INTEGRATOR, "RK4"))
     # Cost, divisor of the step, and integrator.
     settings_with_cost = []
     for divisor in (1, 2, 5, MAX_STEP_DIVISIONS):
-        for name in dict.fromkeys((integrator, STIFF_INTEGRATOR, "RK4")):
+        for name in integrators:
+            # The settings of the model file themselves are left out.
             if (divisor, name) != (1, integrator):
                 settings_with_cost.append((divisor * relative_costs.get(name, 1.0), divisor, name))
     settings_with_cost.sort(key=lambda entry: entry[0])
@@ -150,20 +154,21 @@ def simulate_with_settings(
 ) -> Array:
     """Simulate the first runs of a robot with other integrator or solver settings, without effects.
 
-    Shapes: T samples, C channels, P parameters, s states of a run.
+    Shapes: R simulated runs, T samples, C channels, P parameters, s states of a run.
 
     Args:
         evaluator: evaluator of the recorded runs of a robot.
         numerics: settings of the integrator and the solver.
-        theta: (P,) parameters.
-        initial_states: (R, s) initial states of the first R runs.
+        theta: (P,) parameters; the coefficients of effects among them are not used.
+        initial_states: (R, s) initial states of the first R runs; other runs are not simulated.
 
     Returns:
-        Readings (R, T, C), NaN after the end of a run.
+        Simulated readings (R, T, C), NaN after the end of a run.
     """
     kind = evaluator.kind
     assert issubclass(kind, RobotSimulator)
     run_count = len(initial_states)
+    # The parameters of the system come first in theta, and the same values hold in every run.
     parameters = np.tile(theta[: evaluator.system_parameter_count], (run_count, 1))
     states = dict(zip(evaluator.state_names, initial_states.T, strict=True))
     scenarios = [run.scenario for run in evaluator.prepared_runs[:run_count]]
@@ -181,10 +186,15 @@ class _ReferenceMotions:
         self._checked_runs = evaluator.prepared_runs[:CHECKED_RUN_COUNT]
         self._motions: dict[IntegratorSettings, Array] = {}
 
-    def of(self, numerics: IntegratorSettings) -> Array:
+    def get_motion(self, numerics: IntegratorSettings) -> Array:
         """Return the motion (R, T, C) with a step and integrator, NaN after the end of a run.
 
-        It is simulated at the nominal parameters without effects.
+        It is simulated at the nominal parameters without effects, and cached.
+
+        Shapes: R checked runs, T samples, C channels.
+
+        Args:
+            numerics: time step, integrator and solver options.
         """
         if numerics not in self._motions:
             evaluator = self._evaluator
@@ -194,7 +204,7 @@ class _ReferenceMotions:
             )
         return self._motions[numerics]
 
-    def reference(self, model_settings: IntegratorSettings) -> Array | None:
+    def find_converged_motion(self, model_settings: IntegratorSettings) -> Array | None:
         """Return the converged motion of the robot (R, T, C); None if no integrator converges.
 
         A motion has converged if halving the time step hardly changes it.
@@ -212,24 +222,24 @@ class _ReferenceMotions:
         def simulate(integrator: str, divisor: int) -> Array:
             """Simulate with another integrator and a part of the time step of the file."""
             timestep = model_settings.timestep / divisor
-            return self.of(model_settings._replace(timestep=timestep, integrator=integrator))
+            settings = model_settings._replace(timestep=timestep, integrator=integrator)
+            return self.get_motion(settings)
 
         def extrapolate(divisor: int) -> Array:
             """Extrapolate to the step zero from a part of the time step and half of it, eq. (1)."""
-            coarse, refined = (simulate(STIFF_INTEGRATOR, k) for k in (divisor, 2 * divisor))
+            coarse = simulate(STIFF_INTEGRATOR, divisor)
+            refined = simulate(STIFF_INTEGRATOR, 2 * divisor)
             return 2.0 * refined - coarse
 
         # Divisors of the time step to try; each is compared with a step of half the size.
-        for divisors, get_motion in (
+        for divisors, compute_motion in (
             ((1, 2, 5), partial(simulate, "RK4")),
             ((2, 5), extrapolate),
         ):
             for divisor in divisors:
-                refined = get_motion(2 * divisor)
-                if (
-                    self.compute_rms_difference(get_motion(divisor), refined)
-                    < CONVERGENCE_TOLERANCE
-                ):
+                refined = compute_motion(2 * divisor)
+                change = self.compute_rms_difference(compute_motion(divisor), refined)
+                if change < CONVERGENCE_TOLERANCE:
                     return refined
         return None
 
@@ -271,14 +281,17 @@ def correct_discretisation(
 
         2 q(h / 4) - q(h / 2) - q(h).                                                          (2)
 
-    Shapes: R runs, P parameters.
+    Shapes: R runs, P parameters, s states of a run.
 
     Args:
-        evaluator: evaluator of the recorded runs of a robot.
+        evaluator: evaluator of the recorded runs of a robot; its `discretisation_correction` is
+            set.
         noise: noise of each channel.
         theta: (P,) parameters of a model near the data.
         states: (R, s) initial states of the model.
     """
+    # Only robots without contact have a linearisation. Other systems are not simulated at a fixed
+    # step, and an impact is not smooth in the step size.
     if not evaluator.has_linearisation:
         return
     assert issubclass(evaluator.kind, RobotSimulator)
@@ -298,5 +311,7 @@ def correct_discretisation(
     evaluator.simulation_count += 7 * run_count
     correction = 2.0 * quarter_step - half_step - usual_step  # (2)
     squared_errors = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]
-    if float(np.sqrt(squared_errors.mean())) < MAX_CORRECTABLE_ERROR:
+    rms_error = float(np.sqrt(squared_errors.mean()))
+    # After the end of a shorter run, the correction is NaN and must not change anything.
+    if rms_error < MAX_CORRECTABLE_ERROR:
         evaluator.discretisation_correction = np.nan_to_num(correction)

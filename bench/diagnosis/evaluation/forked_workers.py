@@ -148,6 +148,7 @@ class ForkedWorkerPool:
         for number, item in enumerate(items):
             start_time = time.perf_counter()
             result = task(evaluator, *item)
+            # Only work that workers could share justifies their cost.
             if is_parallel:
                 self._task_seconds += time.perf_counter() - start_time
             yield number, result
@@ -173,7 +174,8 @@ class ForkedWorkerPool:
     def _ensure_workers(self, evaluator: SharedState) -> None:
         """Ensure that the workers have inherited a run evaluator; otherwise replace them.
 
-        A worker has the data that existed when it was forked, so it does not know later ones.
+        A worker has the data that existed when it was forked, so it does not know later ones. Where
+        a process cannot fork, there are no workers afterwards.
         """
         if _contains_object(self._inherited_evaluators, evaluator):
             return

@@ -67,7 +67,12 @@ def compute_noise_floor(evaluator: RunEvaluator, recording: Recording) -> NoiseF
 
     Args:
         evaluator: evaluator, whose simulator defines the channels.
-        recording: recording with all its runs.
+        recording: recording with all its runs; its `noise` has the standard deviations by channel
+            that its description states.
+
+    Returns:
+        Standard deviation of each channel in its unit, quantisation step, and uncertainty of the
+        estimate.
     """
     sigmas, is_stated, steps, uncertainties = [], [], [], []
     for channel in evaluator.simulator.channels:

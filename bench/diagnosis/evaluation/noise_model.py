@@ -96,8 +96,8 @@ def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
     Returns:
         Values of the same shape; whitened noise is independent with variance one.
     """
+    # Derivatives have further axes after that of the channels; noise and masks get them here.
     extra = (1,) * (values.ndim - 3)
-    # Derivatives have further axes after that of the channels.
     phi = noise.phi.reshape(-1, *extra)
     sigma = noise.sigma.reshape(-1, *extra)
     # A Jacobian is large, and multiplication is faster than division.
@@ -113,6 +113,7 @@ def whiten(values: Array, observed_mask: Mask, noise: NoiseModel) -> Array:
         innovations = (samples - phi * previous_samples) / np.sqrt(1.0 - phi * phi)
         whitened[:, 1:] = np.where(has_predecessor, innovations, samples)
 
+    # Missing samples become zero, so that they add nothing to a sum of squares.
     if not observed_mask.all():
         whitened = np.where(observed_mask.reshape(*observed_mask.shape, *extra), whitened, 0.0)
     return whitened
@@ -168,6 +169,9 @@ def maximise_likelihood(
         observed_mask: (R, T, C) mask of available samples.
         fitted_freedom: degrees of freedom used by the fit, subtracted from the samples when sigma
             is estimated.
+
+    Returns:
+        Twice the log-likelihood, summed over the channels, and the noise of each channel.
     """
     log_likelihood = 0.0
     sigmas: list[float] = []
@@ -238,8 +242,11 @@ def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
     Shapes: R runs, T samples.
 
     Args:
-        residual: (R, T) residual of the channel.
-        observed_mask: (R, T) whether a sample is recorded.
+        residual: (R, T, 1) residual of the channel.
+        observed_mask: (R, T, 1) whether a sample is recorded.
+
+    Returns:
+        Distinct correlations (n,), increasing.
     """
     has_predecessor = _has_predecessor(observed_mask)
     previous_samples = residual[:, :-1][has_predecessor]

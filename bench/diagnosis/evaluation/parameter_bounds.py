@@ -75,9 +75,13 @@ def compute_coefficient_bounds(evaluator: RunEvaluator, name: str) -> list[Bound
     Args:
         evaluator: evaluator, which has the coefficients of all effects.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+
+    Returns:
+        Lower and upper end of the range of each coefficient, in the order of the effect.
     """
     effect = evaluator.available_effects[name]
-    # Each coefficient as a parameter of the evaluator, and as the effect declares it.
+    # Each coefficient as a parameter of the evaluator, and as the effect declares it. The last
+    # declared coefficients may not exist on this system, so the lengths may differ.
     pairs = zip(list_coefficients(evaluator, name), effect.coefficients, strict=False)
     return [
         _restrict_to_physical(
@@ -233,6 +237,7 @@ def compute_range_around(evaluator: RunEvaluator, index: int, value: float | Non
         low, high = parameter.bounds
         if value is not None and low <= value <= high:
             break
+        # The narrower range for training would not be consistent with the new bounds.
         parameter = replace(parameter, bounds=widen_range(parameter, limits), training=None)
     return parameter.bounds
 
@@ -277,6 +282,7 @@ def get_physical_limits(evaluator: RunEvaluator, index: int) -> Bounds:
     if lower_limit is None:
         lower_limit = -np.inf
     if upper_limit is None:
+        # An effect at a place of a robot has the same range for every kind of system.
         _, plausible_maximum = coefficient.plausible[0]
         upper_limit = MAX_RANGE_FACTOR_MODEL_FILE * plausible_maximum
     return lower_limit, upper_limit
@@ -285,7 +291,8 @@ def get_physical_limits(evaluator: RunEvaluator, index: int) -> Bounds:
 def _get_coefficient(kind: Any, name: str) -> Any:
     """Return the effect coefficient that a freed parameter of a robot's model file is fitted as.
 
-    It is None for a parameter of the simulator itself.
+    A freed parameter is a number of the model file that the user lets the fit change. The result is
+    None for a parameter of the simulator itself.
 
     Args:
         kind: class of the simulator.
@@ -304,8 +311,8 @@ def _get_physical_limits(parameter: Parameter) -> Bounds:
     A parameter with a nonnegative range stays nonnegative, and a share is at most 1.
     """
     low, high = parameter.bounds
-    share = parameter.unit == "1" and low >= 0.0 and high <= 1.0
-    return 0.0 if low >= 0.0 else -np.inf, 1.0 if share else np.inf
+    is_share = parameter.unit == "1" and low >= 0.0 and high <= 1.0
+    return 0.0 if low >= 0.0 else -np.inf, 1.0 if is_share else np.inf
 
 
 def widen_range(parameter: Parameter, limits: Bounds) -> Bounds:
@@ -326,6 +333,7 @@ def widen_range(parameter: Parameter, limits: Bounds) -> Bounds:
         growth = (WIDENING_FACTOR - 1.0) * (high - low)
         lower, upper = low - growth, high + growth
     lower_limit, upper_limit = limits
+    # A present end that is already beyond its limit stays where it is.
     return max(lower, min(lower_limit, low)), min(upper, max(upper_limit, high))
 
 

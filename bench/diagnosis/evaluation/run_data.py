@@ -64,18 +64,19 @@ def prepare_run(
     """Prepare a run of a recording for a simulator: inputs, observations and initial states.
 
     Args:
-        run: recorded run: times, channels and inputs.
+        run: recorded run: times, channels, inputs, and specified initial values (`run.initial`).
         recording: recording that contains the run, with its constants.
         simulator: simulator that observes the recorded channels.
-        states: names of the initial states.
+        states: names of the initial states that a fit may estimate, in the order of the result.
     """
     columns = [run.channels[c.name] for c in simulator.channels]
     # Constants of a run are valid only in this run.
     constants = {**recording.constants, **run.constants}
     guesses = _guess_initial_states(run, simulator)
+    # States that a fit does not estimate: they are specified, or no channel shows them.
     fixed = {*run.initial, *_find_unobserved_states(simulator)}
-    # Initial values that are not states of the system, such as the pose of a floating base, are not
-    # part of a batch element. They are stated, or follow from closed loops.
+    # Initial values that are not states of the system, such as the pose of a floating base, are the
+    # same in all simulations of the run. They are stated, or follow from closed loops.
     other_names = {*run.initial, *simulator.system.floating_state_units}.difference(states)
     other_initial_values = {name: guesses[name] for name in sorted(other_names)}
     return RunData(
@@ -121,10 +122,12 @@ def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, flo
     for rate in system.rates:
         if rate in run.channels:
             values[rate] = estimate_initial_value_and_slope(run.times, run.channels[rate])[0]
+    # The height is the last coordinate of a system that bounces.
     if system.bounces and system.coordinates[-1] not in run.channels:
         values[system.coordinates[-1]] = _estimate_start_height(run, simulator)
     # Specified values override every guess.
     values.update(run.initial)
+    # Measured and specified joints stay, and the others of a loop are moved.
     return system.close_loops(values, {*run.channels, *run.initial})
 
 

@@ -233,7 +233,8 @@ class RunEvaluator:
         recorded_channels = self.runs[0].channels
         observe = [c.name for c in kind.channels if c.name in recorded_channels]
         default_settings = self._engine_settings
-        # Engines other than the batch engine have no settings, and no finer copy.
+        # Engines other than the batch engine have no settings (an empty dictionary), so the copy
+        # has the same steps.
         fine_settings = default_settings and {
             **default_settings,
             "time_step": MAX_TIME_STEP_FILTERED,
@@ -300,12 +301,14 @@ class RunEvaluator:
         if name not in self.channels:
             return 0.0, 0.0
         values = self.observed[:, :, self.channels.index(name)]
+        # An initial value also avoids an error where all samples are missing.
         return float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=-np.inf))
 
     def _get_effect_coordinate(self, effect: str) -> str:
         """Return the coordinate that an effect acts on; empty if there are no coordinates."""
         system = self.simulator.system
         coordinate = self.available_effects[effect].coordinate
+        # Effects that name no coordinate act on the primary one of the system.
         index = system.primary if coordinate is None else coordinate
         return system.coordinates[index] if system.coordinates else ""
 
@@ -419,10 +422,12 @@ class RunEvaluator:
             Observations (L, T, C); NaN after the simulated share and after the end of a shorter
             run.
         """
+        # Only robots without contact have a linearisation. Their batch elements are simulated
+        # independently of each other, so that a cached result is exactly that of a repeated call.
         if self.has_linearisation:
             simulated = np.empty((len(theta), *self.observed.shape[1:]))
             elements = zip(theta, runs.tolist(), states, strict=True)
-            # All that the result depends on.
+            # A key has all that the result depends on: share, run, parameters and initial states.
             keys = [
                 b"".join(
                     (repr((share, run)).encode(), element_theta.tobytes(), initial_state.tobytes())
@@ -521,6 +526,7 @@ class RunEvaluator:
         evaluator.longest_duration = self.longest_duration
         evaluator.time_span = self.time_span
         # Ranges of the channels are those of these runs, because those of segments would differ.
+        # Each call fills the cache, which the new evaluator then shares.
         for name in self.channels:
             self._get_channel_range(name)
         evaluator._channel_ranges = self._channel_ranges
@@ -582,6 +588,7 @@ class RunEvaluator:
         Args:
             theta: (L, P) parameters.
         """
+        # An effect is active if any of its coefficients is not zero.
         is_active = theta != 0
         is_shifting = is_active[:, self._shifting_coefficients].any(axis=1)
         needs_fine_steps = is_active[:, self._fine_step_coefficients].any(axis=1)
@@ -598,7 +605,7 @@ class RunEvaluator:
     ) -> Array:
         """Simulate L batch elements of recorded runs in one engine call; runs in a worker.
 
-        Shapes: P parameters, s states of a run.
+        Shapes: T' samples of the simulated share, C channels, P parameters, s states of a run.
 
         Args:
             is_fine: whether to use the fine time step that filters need.
@@ -625,11 +632,17 @@ class RunEvaluator:
     ) -> Array:
         """Simulate L batch elements in one engine call.
 
+        Shapes: T samples of the longest scenario, C channels, P parameters, s states of a run.
+
         Args:
             is_fine: whether to use the fine time step that filters need.
-            theta: (L, P) parameters of the system, freed constants, and coefficients of effects.
+            theta: (L, P) parameters of the system, freed constants (those that the fit estimates),
+                and coefficients of effects, in this order.
             scenarios: (L,) input of each element.
             states: (L, s) initial states.
+
+        Returns:
+            Observations (L, T, C), NaN after the end of a shorter scenario.
         """
         simulator = self._fine_step_simulator if is_fine else self.simulator
         # A freed constant is fitted like a parameter, but passed to the simulator as a constant.
@@ -741,6 +754,7 @@ class RunEvaluator:
         """
         self.filtered_runs = filtered_runs
         initial_states = filtered_runs.get_first_states()
+        # A filter that diverged has NaN, and then none of its states is used.
         is_finite = np.isfinite(initial_states).all()
         self.initial_state_guesses = np.where(
             self.known_state_mask | ~is_finite, self.initial_state_guesses, initial_states
@@ -752,10 +766,12 @@ class RunEvaluator:
     def _close_loops(self) -> None:
         """Place unmeasured joints of loops with floating joints where the constraints put them.
 
-        The initial states of floating joints are not fitted, so they have to be consistent with the
-        estimated velocities of the other joints.
+        A loop is a closed chain of bodies, such as a four-bar linkage. The initial states of
+        floating joints are not fitted, so they have to be consistent with the estimated velocities
+        of the other joints.
         """
         system = self.simulator.system
+        # All floating states are required from the user, so that none follows from a loop.
         if system.floating_state_units.keys() == system.required_state_units.keys():
             return
         prepared_runs = []
@@ -765,11 +781,13 @@ class RunEvaluator:
             states = dict(scenario.initial)
             states.update(zip(self.state_names, guess.tolist(), strict=True))
             closed = system.close_loops(states, {*run.channels, *run.initial})
+            # States that a fit estimates are in the guesses; the others are in the scenario.
             guess[:] = [closed[name] for name in self.state_names]
             initial = {name: closed[name] for name in scenario.initial}
             scenario = replace(scenario, initial=initial)
             prepared_runs.append(replace(prepared, scenario=scenario))
         self.initial_state_guesses, self.prepared_runs = guesses, tuple(prepared_runs)
+        # Cached scenarios and the copies in workers have the old initial states.
         self._shortened_scenarios.clear()
         self.worker_pool.forget(self)
 
@@ -834,6 +852,8 @@ def _make_freed_parameter(name: str, simulator: SystemSimulator, recording: Reco
 def _allocate_coefficients(simulator: SystemSimulator, first: int) -> dict[str, slice]:
     """Return the slice of theta of each effect, starting at index `first`.
 
+    Theta is the vector of all parameters: base parameters, then the coefficients of each effect.
+
     Args:
         simulator: simulator with all available effects.
         first: number of base parameters, which precede the coefficients.
@@ -841,6 +861,7 @@ def _allocate_coefficients(simulator: SystemSimulator, first: int) -> dict[str, 
     slices = {}
     # Use the order of the simulator, which is the order of its parameters.
     for effect in simulator.effects:
+        # `Effect.on` returns the coefficients that the effect has on this system.
         end = first + len(effect.on(simulator.system))
         slices[effect.name] = slice(first, end)
         first = end
@@ -848,8 +869,11 @@ def _allocate_coefficients(simulator: SystemSimulator, first: int) -> dict[str, 
 
 
 def _shifts_sample_times(effect: Effect) -> bool:
-    """Return whether an effect reads signals at other times than those of the scenario."""
-    for family in (Input, Sensor):
-        if isinstance(effect, family) and type(effect).times is not family.times:
+    """Return whether an effect reads signals at other times than those of the scenario.
+
+    Such an effect, for example a delay, overrides the method `times` of its base class.
+    """
+    for base_class in (Input, Sensor):
+        if isinstance(effect, base_class) and type(effect).times is not base_class.times:
             return True
     return False

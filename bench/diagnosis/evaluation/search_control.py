@@ -265,7 +265,9 @@ class SearchControl:
             raise SearchStoppedError
 
     def should_abandon_fit(self, share: float) -> bool:
-        """Return whether a fit has to stop now.
+        """Report the progress of a fit, and return whether it has to stop now.
+
+        Once a fit has been stopped, all later fits are stopped, too.
 
         Args:
             share: share of the fit that is finished, 0 to 1.
@@ -295,7 +297,7 @@ class SearchControl:
         state = self.deadline, self._stop_reason, self._has_abandoned_fits
         if self.deadline is not None:
             self.deadline += self._reserve
-        # If the user has stopped the search, `should_stop` finds out again.
+        # If the user has stopped the search, `should_stop` detects this again by its callback.
         self._stop_reason, self._has_abandoned_fits = None, False
         try:
             yield
@@ -326,6 +328,8 @@ class SearchControl:
         Args:
             share: finished share of the present step, 0 to 1.
         """
+        # Part of the question that remains after the finished steps, and then after a part of the
+        # present one.
         remaining_share = (1.0 - PROGRESS_STEP_SHARE) ** self._finished_steps
         finished_share = 1.0 - remaining_share * (1.0 - PROGRESS_STEP_SHARE * share)
         total_weight = self._finished_weight + self._current_weight + self._later_weight

@@ -35,13 +35,13 @@ class SimulationCache:
 
         The oldest results are removed if the memory limit `CACHE_BYTES` is exceeded.
 
-        Shapes: T samples, C channels.
+        Shapes: L batch elements, N of them simulated now, T samples, C channels.
 
         Args:
-            keys: keys of all elements, as passed to `missing`.
+            keys: (L,) keys of all elements, as passed to `missing`.
             missing_indices: indices of the elements that `missing` returned.
             results: (N, T, C) results of these elements.
-            out: (L, T, C) output array for the results of all elements.
+            out: (L, T, C) output array for the results of all elements, changed in place.
         """
         new_results = {
             keys[index]: result for index, result in zip(missing_indices, results, strict=True)

@@ -66,8 +66,9 @@ def rank_option_alternatives(
 ) -> list[OptionAlternative]:
     """Simulate the runs with alternative solver options, and rank those that explain them better.
 
-    1. Compute the sum of squares that an alternative must not exceed. It is lower for a further
-       option than for another value of the options that have been changed already.
+    1. Compute the sum of squares that an alternative must not exceed. It is lower if the
+       alternative changes a further option than if it only has another value of an option that
+       already differs from the model file, because each changed option must clearly help.
     2. Simulate all alternatives.
     3. Leave out those that make the same motion as a better one.
 
@@ -98,7 +99,9 @@ def rank_option_alternatives(
     limit = present_squares - MIN_SQUARES_DECREASE
     limit_of_further_option = limit
     if present_squares > MIN_CLEAR_MEAN_SQUARE * samples:
+        # Noise alone has a sum of squares of one per sample; the rest is the excess.
         limit_of_further_option = samples + MAX_EXCESS_RATIO * (present_squares - samples)
+    # Options that differ from the model file.
     changed_options = list_changed_options(kind.robot, kind.numerics).keys()
     # 2. Simulations.
     ranked: list[tuple[OptionAlternative, Array]] = []
@@ -113,8 +116,10 @@ def rank_option_alternatives(
     ranked.sort(key=lambda pair: pair[0].squares)
     distinct: list[tuple[OptionAlternative, Array]] = []
     for alternative, motion in ranked:
-        differences = [float(np.square(motion - known).sum()) / samples for _, known in distinct]
-        if all(difference >= MIN_DISTINCT_CHANGE**2 for difference in differences):
+        mean_square_differences = [
+            float(np.square(motion - known).sum()) / samples for _, known in distinct
+        ]
+        if all(difference >= MIN_DISTINCT_CHANGE**2 for difference in mean_square_differences):
             distinct.append((alternative, motion))
     return [alternative for alternative, _ in distinct]
 
@@ -129,7 +134,8 @@ def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSett
         kind: simulator class of the robot.
     """
     settings = kind.numerics
-    # Present value of each option: changed already, or that of the model file.
+    # Present value of each option: changed already, or that of the model file. The integrator is
+    # always among the settings.
     present = settings.to_model_options()
     for name in ("cone", "impratio", "noslip_iterations", "solver", "iterations"):
         present.setdefault(name, read_option(kind.robot, name))

@@ -126,11 +126,13 @@ def _simulate_autoregression(
         channel_mask = observed_mask[:, :, channel_index]
         filled = np.where(channel_mask, residual[:, :, channel_index], 0.0)
         innovations = _compute_centred_innovations(filled, channel_mask, channel_weights)
-        step = max(
+        # Number of surrogates that are simulated at once.
+        chunk_size = max(
             MAX_CHUNK_SIZE // ((length + BURN_IN_SAMPLES) * runs), MIN_CHUNK_WIDTH // runs, 1
         )
-        for first in range(0, count, step):
-            surrogates = result[first : first + step, :, :, channel_index]
+        for first in range(0, count, chunk_size):
+            # A view: writing to it fills the result.
+            surrogates = result[first : first + chunk_size, :, :, channel_index]
             drawn_innovations = rng.choice(
                 innovations, size=(length + BURN_IN_SAMPLES, len(surrogates), runs)
             )
@@ -189,8 +191,9 @@ def _drive_autoregression(weights: Array, innovations: Array) -> Array:
     reversed_weights = weights[::-1]
     # A sample depends only on earlier ones, which are complete by then.
     for t in range(1, len(flat)):
-        before = flat[max(t - order, 0) : t]
-        flat[t] += reversed_weights[order - len(before) :] @ before
+        previous = flat[max(t - order, 0) : t]
+        # The first samples have fewer than `order` predecessors.
+        flat[t] += reversed_weights[order - len(previous) :] @ previous
     return innovations
 
 
@@ -340,6 +343,10 @@ def _solve_yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
 
 
 def _compute_max_root(weights: Array) -> float:
-    """Return the largest modulus of the roots; the impulse response is a sum of their powers."""
+    """Return the largest modulus of the roots of an autoregression with weights (p,).
+
+    The roots solve z^p = sum_k a_k z^(p-k). The impulse response is a sum of their powers, so the
+    process is stationary if all of them lie inside the unit circle.
+    """
     roots = np.roots(np.concatenate([[1.0], -weights]))
     return float(np.abs(roots).max(initial=0.0))

@@ -157,7 +157,8 @@ def fit_base_model(
         order = np.argsort(compute_start_costs(evaluator, noise, starts), kind="stable")
         starts = [starts[i] for i in order[:FITTED_STARTS]]
 
-    # 2. Longer and longer parts of the runs.
+    # 2. Longer and longer parts of the runs. A state filter has already found initial states near
+    # the best ones, so that whole runs can be fitted at once.
     for horizon in FIT_HORIZONS if evaluator.filtered_runs is None else FILTERED_FIT_HORIZONS:
         evaluator.search_control.report(f"base fit, first {horizon.share:.0%} of the runs")
         fits = TrajectoryFitter(evaluator, noise, share=horizon.share).fit_models(
@@ -167,10 +168,10 @@ def fit_base_model(
         best = min(fits, key=lambda fit: fit.cost)
         if best.cost > max_cost and horizon.share < 1.0:
             return BaseFit(best, frozenset())
-    # 3. Derivatives at the fitted model.
+    # 3. Derivatives at the fitted model, by initial states. All later fits share them. Without a
+    # filter, they were computed about the first start, far from the fitted model.
     if evaluator.has_linearisation and evaluator.filtered_runs is None:
-        # They are those by initial states, which all later fits share. Without a filter, they were
-        # computed about the first start. The import is local, because only robots need it.
+        # The import is local, because only robots need it.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 
         compute_state_jacobian(evaluator, best.theta, best.initial_states, is_recomputed=True)
@@ -246,7 +247,9 @@ def compute_lowest_start_cost(evaluator: RunEvaluator, noise: NoiseModel, share:
         FitStart((), theta, evaluator.initial_state_guesses)
         for theta in _list_starts(evaluator, None)
     ]
-    return float(compute_start_costs(evaluator, noise, starts, share, np.inf).min())
+    # A start that fails anywhere has an infinite cost.
+    costs = compute_start_costs(evaluator, noise, starts, share, failed_residual=np.inf)
+    return float(costs.min())
 
 
 def compute_start_costs(
@@ -267,7 +270,11 @@ def compute_start_costs(
         noise: noise that weights the channels.
         starts: parameters and initial states.
         share: fraction of each run, from its beginning, that counts.
-        failed_residual: residual of a sample that could not be simulated.
+        failed_residual: residual of a sample that could not be simulated, in the unit of the
+            channel.
+
+    Returns:
+        Sums of squares (n,) of the n starts.
     """
     thetas = np.array([s.theta for s in starts])
     states = np.array([s.initial_states for s in starts])
@@ -318,6 +325,7 @@ def _list_wider_bounds(evaluator: RunEvaluator, base: BaseFit) -> dict[str, Boun
     for index in evaluator.base_indices.tolist():
         parameter = evaluator.parameters[index]
         low, high = parameter.bounds
+        # The end of the range at which the fitted value lies, "low" or "high"; None inside.
         bound = bound_of(float(base.fit.theta[index]), low, high)
         lower, upper = widen_range(parameter, get_physical_limits(evaluator, index))
         is_widened = (bound == "low" and lower < low) or (bound == "high" and upper > high)

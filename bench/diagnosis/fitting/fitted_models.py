@@ -164,6 +164,7 @@ class ModelSet:
         parameters and determined initial states, n samples, and for each effect e its k_e
         coefficients and the gain c_e of its best shape from noise alone.
         """
+        # k of (1): fitted parameters, and initial states that the data determine.
         freedom = fit.free_indices.size + count_identified_states(self.evaluator, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
         likelihood = FAILED_LIKELIHOOD
@@ -251,7 +252,8 @@ class ModelSet:
         if is_staged:
             starts = self._select_promising_starts(starts, noise)
         # 2. Fits.
-        # Sums of squares with different weights are not comparable.
+        # With noise weights other than those of the stored fits, sums of squares could not be
+        # compared with theirs.
         is_race = is_racing and noise is self.noise
         lowest_cost = self._find_lowest_cost(starts) if is_race else np.inf
         fitter = TrajectoryFitter(self.evaluator, noise, self.fixed_parameters)
@@ -325,6 +327,7 @@ class ModelSet:
         fitter = TrajectoryFitter(self.evaluator, self.noise, self.fixed_parameters)
         (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
         result = replace(model, fit=replace(model.fit, jacobian=fit.jacobian, is_own_jacobian=True))
+        # Later calls for the stored model then need no computation.
         if stored_model is model:
             self.models[frozenset(model.effects)] = result
         return result
@@ -406,6 +409,7 @@ class ModelSet:
         """
         max_size = max(len(start.effects) for start in starts)
         fitted_models = self.models.values()
+        # Larger models have lower costs merely because of their size.
         costs = [m.fit.cost for m in fitted_models if 0 < len(m.effects) <= max_size]
         return min(costs, default=np.inf)
 
@@ -462,10 +466,12 @@ def count_identified_states(
     They count as fitted parameters when the noise is estimated; a state without influence on the
     data does not. These are the effective degrees of freedom of ridge regression (T. Hastie, R.
     Tibshirani, J. Friedman, The Elements of Statistical Learning, 2nd ed., section 3.4.1). With the
-    derivatives B_i of run i by its initial state in units of the noise, the prior π, and the
-    eigenvalues λ_ij of π B_iᵀ B_i π:
+    derivatives B_i of run i by its initial state in units of the noise, the diagonal matrix π of
+    the prior standard deviations of the states, and the eigenvalues λ_ij of π B_iᵀ B_i π:
 
         f = Σ_ij λ_ij / (1 + λ_ij)                                                               (2)
+
+    The result need not be an integer, because a state may be determined only in part.
 
     Args:
         evaluator: evaluator with the recorded runs.
@@ -477,11 +483,13 @@ def count_identified_states(
     scaled = state_jacobian / noise.sigma[:, None]
     # The shape is written out, because -1 is ambiguous if there are no states.
     run_count, length, channels, state_count = scaled.shape
+    # B_i π of each run, (R, T C, s).
     columns = scaled.reshape(run_count, length * channels, state_count) * compute_state_prior(
         evaluator
     )
     # A known state is not a degree of freedom.
     columns = np.where(evaluator.known_state_mask[:, None, :], 0.0, columns)
+    # π B_iᵀ B_i π of each run, (R, s, s).
     normal = np.matmul(columns.transpose(0, 2, 1), columns)
     eigenvalues = np.linalg.eigvalsh(normal)
     # Rounding may make an eigenvalue slightly negative.

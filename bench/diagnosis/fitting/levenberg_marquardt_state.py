@@ -290,7 +290,10 @@ class FitState:
     has_unreliable_states: bool = False
 
     def compute_state_damping(self) -> Array:
-        """Return the damping (R, s) of each initial state for the next step."""
+        """Return the damping (R, s) of each initial state for the next step.
+
+        A state has its own damping only if nothing but initial states of a robot is fitted.
+        """
         if self.fits_rough_states:
             return self.state_damping
         return np.full_like(self.state_damping, self.damping)
@@ -305,7 +308,8 @@ class FitState:
         """True if the derivatives by initial states that all models share are not good enough.
 
         This is the case if the model is near the data, but its derivatives by parameters had to be
-        recomputed several times, or if they may be wrong.
+        recomputed several times, or if those by initial states may be wrong
+        (`has_unreliable_states`).
         """
         is_slow = (
             self.has_rough_cost
@@ -330,14 +334,15 @@ class FitState:
         """
         low, high = UNRELIABLE_MEAN_SQUARES
         is_unreliable = low < self.point.cost / max(self.sample_count, 1) < high
-        has_moved = self.point.cost < self.own_state_cost - self.get_tolerance(self.point.cost)
-        self.has_unreliable_states = self.can_stick and is_unreliable and has_moved
+        # The cost at the last own derivatives is infinite if the fit has none yet.
+        has_improved = self.point.cost < self.own_state_cost - self.get_tolerance(self.point.cost)
+        self.has_unreliable_states = self.can_stick and is_unreliable and has_improved
         if self.has_unreliable_states:
             self.is_jacobian_stale = True
         return self.has_unreliable_states
 
     def end(self) -> None:
-        """End the fit, unless derivatives by initial states of its own may improve it."""
+        """End the fit, unless derivatives by initial states about its own model may improve it."""
         self.is_finished = not self._ask_for_own_states()
 
     def get_tolerance(self, cost: float) -> float:
@@ -455,18 +460,20 @@ class FitState:
             is_own_jacobian: whether the derivatives were computed at the point where the step
                 began.
         """
+        # The minimum avoids a division by zero.
         gain_ratio = decrease / max(self.predicted_decrease, 1e-300)  # (1)
-        self.is_jacobian_stale = (
-            not self.has_own_jacobian and abs(gain_ratio - 1.0) > JACOBIAN_REUSE_TOLERANCE
-        )
+        is_predicted = abs(gain_ratio - 1.0) <= JACOBIAN_REUSE_TOLERANCE
+        # `has_own_jacobian` is about the new point: updated derivatives serve for another step
+        # only if this step was predicted well.
+        self.is_jacobian_stale = not self.has_own_jacobian and not is_predicted
         self.damping = float(reduce_damping(self.damping, gain_ratio))
         self.growth = INITIAL_DAMPING_GROWTH
         # Far from the data, the fit hardly gains any more.
         is_stagnant = gain_ratio < STAGNANT_RATIO and decrease < STAGNANT_SHARE * cost
         if is_own_jacobian and not self.is_final_fit and is_stagnant and self._is_far(cost):
             self.is_finished = True
-        # The cost is too rough to predict at the scale of the remaining gain.
-        is_predicted = abs(gain_ratio - 1.0) <= JACOBIAN_REUSE_TOLERANCE
+        # Even exact derivatives did not predict this step: the cost is too rough at the scale of
+        # the remaining gain.
         largest = max(decrease, self.predicted_decrease)
         if is_own_jacobian and not is_predicted and self._is_rough_at(largest):
             self.end()
@@ -477,19 +484,24 @@ class FitState:
     def adapt_state_damping(self, decreases: Array, is_moved: Mask) -> None:
         """Update the damping of each initial state after a step of initial states alone.
 
-        It increases, eq. (3), if the squared residual of the channels of the state decreased far
-        less than predicted. Otherwise it follows its gain ratio, eq. (2), if the run takes the
-        step.
+        The channels of a state are those that show it best: position and velocity of its joint. If
+        their squared residual decreased far less than predicted, the damping lambda of the state
+        becomes 2 nu lambda with its growth factor nu, which is doubled, eq. (3). Otherwise lambda
+        follows the gain ratio (actual by predicted decrease), eq. (2), if the run takes the step.
+
+        Shapes: R runs, C channels, s states of a run.
 
         Args:
             decreases: (R, C) decrease of the squared residual of each channel by the step.
             is_moved: (R,) mask of the runs that take the step.
         """
+        # Decrease of the squared residual of the channels of each state, (R, s).
         predicted = self.predicted_decreases @ self.channels_of_states
         actual = decreases @ self.channels_of_states
         # A simulation that was abandoned or diverged has no finite decrease.
         with np.errstate(all="ignore"):
             loss = predicted - actual
+            # Negated, so that a loss that is NaN also counts as bad.
             is_bad = ~(loss <= MAX_LOSS_SHARE * np.abs(predicted) + CONVERGENCE_TOLERANCE)
             gain_ratios = np.clip(actual / np.maximum(predicted, 1e-300), 0.0, 1.0)
         is_reduced = (predicted > 0.0) & is_moved[:, None]
@@ -509,14 +521,18 @@ class FitState:
         3. Otherwise the next step is shorter: the damping lambda becomes 2 nu lambda, and its
            growth factor nu becomes 2 nu, eq. (3).
         """
+        # 1. Derivatives.
         if not self.has_own_jacobian:
             self.is_jacobian_stale = True
             return
+        # This marks the derivatives by initial states for recomputing if they may be wrong.
         if self._ask_for_own_states():
             return
+        # 2. Rough cost.
         if self._is_rough_at(self.predicted_decrease):
             self.is_finished = True
             return
+        # 3. Damping.
         self.damping = self.damping * INITIAL_DAMPING_GROWTH * self.growth
         self.growth = INITIAL_DAMPING_GROWTH * self.growth
 

@@ -84,10 +84,12 @@ class _ArrowheadEquations:
     def solve(self, blocked_mask: Mask) -> tuple[Array, Array]:
         """Solve the normal equations for one damped step, by the Schur complement.
 
-        The initial states of a run influence only this run, so they are eliminated first. The step
-        of the parameters follows from (U - sum W_i V_i^-1 W_i') dx = a - sum W_i V_i^-1 b_i, eq.
-        (4), and that of the initial states of run i from dz_i = V_i^-1 b_i - V_i^-1 W_i' dx, eq.
-        (5).
+        The equations are U dx + sum W_i dz_i = a and, for each run i, W_i' dx + V_i dz_i = b_i,
+        for the step dx of the shared parameters and the steps dz_i of the initial states. The
+        initial states of a run influence only this run, so they are eliminated first. The step of
+        the parameters follows from (U - sum W_i V_i^-1 W_i') dx = a - sum W_i V_i^-1 b_i, eq. (4),
+        and that of the initial states of run i from dz_i = V_i^-1 b_i - V_i^-1 W_i' dx, eq. (5).
+        The fields `shared`, `cross`, `inner`, `gradient` and `pull` are U, W, V, a and b.
 
         Shapes: R runs, q fitted parameters, s states of a run.
 
@@ -98,6 +100,7 @@ class _ArrowheadEquations:
             The steps of the shared parameters (q,) and of the initial states (R, s); NaN if the
             derivatives give no usable step.
         """
+        # The matrix of (4), and V⁻¹ Wᵀ of all runs.
         schur, inverse_cross = compute_schur_complement(self.shared, self.cross, self.inner)
         # V⁻¹ b of all runs.
         columns = self.pull[:, :, None]
@@ -129,15 +132,17 @@ class _ArrowheadEquations:
 def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, Array]:
     """Eliminate the initial states of every run from the normal equations.
 
-    The Schur complement U - sum_i W_i V_i^-1 W_i' is the matrix of eq. (4) of the module docstring,
-    the equations of the shared parameters alone.
+    The normal equations are U dx + sum_i W_i dz_i = a and W_i' dx + V_i dz_i = b_i, for the steps
+    dx of the shared parameters and dz_i of the initial state of run i. The Schur complement U -
+    sum_i W_i V_i^-1 W_i' is the matrix of eq. (4) of the module docstring, the equations of the
+    shared parameters alone.
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
     Args:
-        shared: (q, q) U.
-        cross: (R, q, s) all W_i.
-        inner: (R, s, s) all V_i.
+        shared: (q, q) matrix U of the shared parameters.
+        cross: (R, q, s) matrix W_i of each run, which couples parameters and initial states.
+        inner: (R, s, s) matrix V_i of the initial states of each run.
 
     Returns:
         The Schur complement (q, q), and all V_i⁻¹ W_iᵀ (R, s, q).
@@ -150,21 +155,22 @@ def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple
 
 
 def hold_known_states(inner: Array, cross: Array, known_mask: Mask) -> tuple[Array, Array]:
-    """Fix known initial states in the normal equations.
+    """Fix known initial states in the normal equations of a Gauss-Newton step.
 
     The equation of a known state becomes: its step is zero. No parameter and no other state is
-    coupled to it.
+    coupled to it. The caller sets the right-hand side of this equation to zero.
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
     Args:
-        inner: (R, s, s) all V_i.
-        cross: (R, q, s) all W_i.
+        inner: (R, s, s) matrix V_i of the initial states of each run.
+        cross: (R, q, s) matrix W_i of each run, which couples parameters and initial states.
         known_mask: (R, s) mask of known initial states.
 
     Returns:
         The changed V_i and W_i.
     """
+    # Elements in the row or the column of a known state become those of the identity matrix.
     is_coupled = known_mask[:, :, None] | known_mask[:, None, :]
     decoupled = np.where(is_coupled, np.eye(inner.shape[1]), inner)
     return decoupled, np.where(known_mask[:, None, :], 0.0, cross)
@@ -265,7 +271,7 @@ def _apply_damping(
     A small ridge is always added to U, so that it can be inverted if two parameters have the same
     response.
 
-    Shapes: R runs, s states of a run.
+    Shapes: R runs, q fitted parameters, s states of a run.
 
     Args:
         equations: normal equations with the blocks U of the parameters and V of the initial states.
@@ -273,12 +279,14 @@ def _apply_damping(
         state_damping: (R, s) damping of each initial state, for the diagonal of V.
         known_mask: (R, s) mask of the known initial states.
     """
+    # Diagonals of all V, (R, s).
     diagonal = np.einsum("rii->ri", equations.inner)
     added = state_damping * diagonal
     inner = equations.inner + added[:, :, None] * np.eye(equations.inner.shape[1])
     inner, cross = hold_known_states(inner, equations.cross, known_mask)
     pull = np.where(known_mask, 0.0, equations.pull)
 
+    # Diagonal of U, (q,).
     scale = np.maximum(np.diagonal(equations.shared), MIN_DIAGONAL)
     shared = equations.shared + np.diag(damping * scale + RIDGE_SHARE * scale + MIN_DIAGONAL)
     return _ArrowheadEquations(shared, cross, inner, equations.gradient, pull)

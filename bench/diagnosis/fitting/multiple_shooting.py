@@ -124,11 +124,10 @@ def forgets_initial_state(evaluator: RunEvaluator, noise: NoiseModel, derivative
         axis=2
     )
     for influence, length in zip(state_influence, evaluator.lengths, strict=True):
-        last_samples = influence[int((1.0 - RUN_END_SHARE) * length) : int(length)]
         # If all initial states of a run are known, the decay of their influence cannot be measured.
-        if (
-            not influence.any()
-            or (last_samples.max(axis=0) > MAX_STATE_INFLUENCE * influence.max(axis=0)).any()
-        ):
+        if not influence.any():
+            return False
+        last_samples = influence[int((1.0 - RUN_END_SHARE) * length) : int(length)]
+        if (last_samples.max(axis=0) > MAX_STATE_INFLUENCE * influence.max(axis=0)).any():
             return False
     return True

@@ -70,6 +70,7 @@ def iterate_rounds(iterations: int, is_racing: bool) -> Iterator[RacingRound]:
         is_racing: whether the fits exchange their best cost after each short round, to stop those
             that are far behind; otherwise there is only one round.
     """
+    # The total is 1 and not 0, because it is a divisor of the progress.
     if not iterations:
         yield RacingRound(0, 0, 1)
     begin = 0
@@ -170,11 +171,11 @@ class TrajectoryFitter:
         for racing_round in iterate_rounds(iterations, is_racing):
             # 1. Unfinished fits.
             unfinished = [i for i, fit_state in enumerate(fit_states) if not fit_state.is_finished]
-            if not unfinished or (
-                racing_round.first
-                and self.evaluator.search_control.should_abandon_fit(
-                    racing_round.first / iterations
-                )
+            if not unfinished:
+                break
+            # The first round is always made, because it simulates the starts.
+            if racing_round.first and self.evaluator.search_control.should_abandon_fit(
+                racing_round.first / iterations
             ):
                 break
             # 2. Lowest cost.
@@ -194,6 +195,7 @@ class TrajectoryFitter:
             for number, members in self.evaluator.worker_pool.map_unordered(
                 self.evaluator, _advance_group, worker_arguments
             ):
+                # A worker returns changed copies of the states.
                 for i, fit_state in zip(groups[number], members, strict=True):
                     fit_states[i] = fit_state
                     if fit_state.is_finished or racing_round.last >= iterations:
@@ -240,7 +242,8 @@ class TrajectoryFitter:
             sum(1 + fit_states[i].free_indices.size + state_count for i in unfinished) * run_count
         )
         cost = element_count * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
-        # Compiled batch elements are stepped in parallel, however long they are.
+        # The engine steps the elements of a call in parallel, so a group has enough of them,
+        # however long they are.
         group_count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, element_count / MIN_CHUNK_SIZE)))
         step_kinds = evaluator.group_compatible(
             np.stack([fit_states[i].point.start.theta for i in unfinished])
@@ -292,20 +295,21 @@ class TrajectoryFitter:
             )
             # 4. Steps.
             trials = list(self._propose_trials(fit_states, sample_mask))
-            # Fits that wait for derivatives continue in a later iteration.
-            if not trials and any(p.is_waiting and not p.is_finished for p in fit_states):
-                continue
-            # The caller checks whether the fit was stopped early here.
-            if not trials or self.evaluator.search_control.should_abandon_fit(
-                iteration / racing_round.all
-            ):
+            if not trials:
+                # Fits that wait for derivatives continue in a later iteration.
+                if any(p.is_waiting and not p.is_finished for p in fit_states):
+                    continue
                 break
-            make_points = (
+            # The caller checks whether the fit was stopped early here.
+            if self.evaluator.search_control.should_abandon_fit(iteration / racing_round.all):
+                break
+            simulate_points = (
                 self._simulate_without_derivatives
                 if self._updates_derivatives
                 else self._simulate_points
             )
-            for (fit_state, _), point in zip(trials, make_points(trials, sample_mask), strict=True):
+            points = simulate_points(trials, sample_mask)
+            for (fit_state, _), point in zip(trials, points, strict=True):
                 self._accept_or_reject_trial(fit_state, point, sample_mask)
         return list(fit_states)
 
@@ -444,7 +448,8 @@ class TrajectoryFitter:
             start: effects, theta and initial states from which the fit begins.
         """
         evaluator = self.evaluator
-        # Bounds of the fitted parameters by index in theta: base parameters, then coefficients.
+        # Bounds of the fitted parameters by index in theta: base parameters, then coefficients of
+        # the effects of the start.
         bounds: dict[int, Bounds] = {}
         if self.fits_parameters:
             base = [i for i in evaluator.base_indices.tolist() if i not in self.fixed_parameters]
@@ -465,6 +470,7 @@ class TrajectoryFitter:
         theta[fitted_indices] = np.clip(theta[fitted_indices], low, high)
         clipped_start = replace(start, theta=theta, initial_states=start.initial_states.copy())
         return FitState(
+            # The start is simulated later, together with those of other fits.
             point=FitPoint(clipped_start, np.empty(0), np.empty(0), np.inf),
             free_indices=np.array(fitted_indices, dtype=np.intp),
             low=low,
@@ -517,6 +523,7 @@ class TrajectoryFitter:
             point_simulations = simulated[first:end]
             first = end
             jacobian = self._compute_derivatives(point_simulations, steps, state_indices)
+            # The last columns are the derivatives by initial states.
             if self.evaluator.has_linearisation:
                 jacobian[..., fit_state.free_indices.size :] = (
                     self._compute_initial_state_derivatives(
@@ -600,7 +607,7 @@ class TrajectoryFitter:
 
         Args:
             simulated: (1 + q + n, R, T, C) simulation without and with each unknown displaced.
-            steps: (q + s,) displacements.
+            steps: (q + s,) displacements of all unknowns, parameters first.
             state_indices: (n,) indices of the initial states that are displaced.
         """
         known_mask = self.evaluator.known_state_mask
@@ -805,13 +812,15 @@ class TrajectoryFitter:
             point: the simulated trial point.
             sample_mask: (R, T, C) samples that count in the cost.
         """
-        is_blocked = False
+        has_worse_runs = False
         if fit_state.fits_rough_states:
-            point, is_blocked = self._step_improved_runs(fit_state, point, sample_mask)
+            point, has_worse_runs = self._step_improved_runs(fit_state, point, sample_mask)
         decrease = fit_state.point.cost - point.cost
         # A small gain of some runs is no sign of convergence while the steps of others fail.
-        is_accepted = decrease > (fit_state.get_tolerance(point.cost) if is_blocked else 0.0)
-        # Whether the step was computed with derivatives of the point where it began.
+        min_decrease = fit_state.get_tolerance(point.cost) if has_worse_runs else 0.0
+        is_accepted = decrease > min_decrease
+        # True if the step was computed with derivatives of the point where it began; the flag of
+        # the fit is about the new point from here on.
         is_own_jacobian = fit_state.has_own_jacobian
         if is_accepted:
             if self._updates_derivatives:
@@ -837,8 +846,8 @@ class TrajectoryFitter:
             sample_mask: (R, T, C) samples that count in the cost.
 
         Returns:
-            The trial point with the present states in the runs whose cost is not lower with the
-            trial; and whether there are such runs.
+            The trial point, with the present states in the runs whose cost the trial does not
+            decrease; and whether the trial increases the cost of any run.
         """
         last = fit_state.point
         last_squares, squares = (
@@ -864,12 +873,14 @@ def _find_channels_of_states(evaluator: RunEvaluator) -> Mask:
     Args:
         evaluator: the runs.
     """
+    # Names are `q.JOINT` for a position and `qd.JOINT` for a velocity.
     joints_of_channels, joints_of_states = (
         np.array([name.partition(".")[2] for name in names])
         for names in (evaluator.channels, evaluator.state_names)
     )
     is_of_joint = np.array([name.startswith(("q.", "qd.")) for name in evaluator.channels])
     shows: Mask = (joints_of_channels[:, None] == joints_of_states) & is_of_joint[:, None]
+    # A state that no channel shows gets all channels.
     return shows | ~shows.any(axis=0)
 
 
@@ -894,7 +905,15 @@ def _combine_runs(last: FitPoint, trial: FitPoint, is_moved: Mask, costs: Array)
 
 
 def _can_stick(evaluator: RunEvaluator, names: Sequence[str]) -> bool:
-    """Return whether one of some effects is, or contains, dry friction that can hold a joint."""
+    """Return whether one of some effects is, or contains, dry friction that can hold a joint.
+
+    An effect names in `contains` the simpler effects to which it reduces if some of its
+    coefficients are zero.
+
+    Args:
+        evaluator: the runs, with all effects of their simulator.
+        names: names of the effects of a model.
+    """
     available = evaluator.available_effects
     parts = {part for name in names for part in (name, *available[name].contains)}
     return any(is_dry_friction(available[part]) for part in parts & available.keys())
