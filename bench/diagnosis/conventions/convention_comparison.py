@@ -196,10 +196,11 @@ class ConventionComparison:
         ]
         if copies:
             return copies
+        # The log as its description states it, and as it is corrected so far.
         described = corrected = self.subject.recording
         differences: list[ConventionDifference] = []
         for _ in range(MAX_DIFFERENCES):
-            # 1. Suspects.
+            # 1. Suspects. Short segments of some runs are enough.
             suspects = self._list_suspect_joints(
                 self._filter_runs(self._select_segments(corrected))
             )
@@ -287,11 +288,11 @@ class ConventionComparison:
             recording: Recording under one hypothesis.
         """
         filtered_runs = self._filter_runs(self._select_segments(recording))
-        return (
-            float((filtered_runs.force / filtered_runs.typical).max())
-            if filtered_runs.has_expected_innovations
-            else np.inf
-        )
+        # Without expected innovations, the filter does not follow the readings: it diverges.
+        if not filtered_runs.has_expected_innovations:
+            return np.inf
+        # Missing and typical force of each joint.
+        return float((filtered_runs.force / filtered_runs.typical).max())
 
     def _list_suspect_joints(self, filtered_runs: FollowedRuns) -> list[JointSignals]:
         """Return the joints whose conventions may be wrong.
@@ -311,19 +312,18 @@ class ConventionComparison:
         if not filtered_runs.has_expected_innovations:
             return self._generator.joints
         coordinates = self.subject.kind.system.coordinates
+        # Forces at joints come first; forces at contacts or floating bodies may follow.
         relative_missing_forces = (filtered_runs.force / filtered_runs.typical)[: len(coordinates)]
-        is_missing = (
-            filtered_runs.missing_forces.any()
-            or relative_missing_forces.max() > ABSURD_MISSING_FORCE
-        )
-        if not is_missing or relative_missing_forces.max() <= MIN_MISSING_FORCE:
+        largest = float(relative_missing_forces.max())
+        # `missing_forces` is the result of a significance test for each force.
+        is_missing = filtered_runs.missing_forces.any() or largest > ABSURD_MISSING_FORCE
+        if not is_missing or largest <= MIN_MISSING_FORCE:
             return []
         # A wrong joint disturbs others, so the limit grows with the largest force.
-        limit = min(
-            SUSPECT_SHARE * max(1.0, float(relative_missing_forces.max())), MAX_SUSPECT_LIMIT
-        )
-        if relative_missing_forces.max() < LARGE_MISSING_FORCE:
-            limit = SIMILAR_SHARE * float(relative_missing_forces.max())
+        limit = min(SUSPECT_SHARE * max(1.0, largest), MAX_SUSPECT_LIMIT)
+        # If all forces are small, only those of similar size to the largest count.
+        if largest < LARGE_MISSING_FORCE:
+            limit = SIMILAR_SHARE * largest
         relative_force_of = dict(zip(coordinates, relative_missing_forces.tolist(), strict=True))
         return [
             joint
@@ -344,6 +344,10 @@ class ConventionComparison:
         3. Compute the log-likelihood of the others on all runs.
         4. Refine free offsets, and require that factors of inputs are better than no inputs.
         5. Of equally likely hypotheses, select the simplest; the others are stated with it.
+
+        Args:
+            recording: recording as it is described, or with some conventions corrected.
+            suspects: joints whose conventions may be wrong.
         """
         # 1. Limits. The log as described is the hypothesis without any changes.
         described = ConventionHypothesis("")
@@ -360,10 +364,12 @@ class ConventionComparison:
         force_error = self._compute_log_force_error(described, recording, worst_run)
         best_by_description: dict[str, tuple[float, ConventionHypothesis]] = {}
         evaluated_changes: list[object] = []
+        # An evaluation is one run of the filter.
         last_evaluation = self.evaluations + MAX_EVALUATIONS
         for hypothesis in self._generator.generate(recording, suspects):
             if self.evaluations >= last_evaluation:
                 break
+            # Several generators may propose one change in different words.
             key = dict(hypothesis.changes), hypothesis.late
             if key in evaluated_changes:
                 continue
@@ -402,6 +408,7 @@ class ConventionComparison:
             hypothesis for score, hypothesis in accepted if score > best - EQUAL_LOG_LIKELIHOOD
         ]
         simplest, *others = sorted(equally_likely, key=lambda hypothesis: hypothesis.size)
+        # The limit contains the margin, and the gain is over the log as described.
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
         return ConventionDifference(simplest, gain, tuple(others[: MAX_NAMED - 1]))
 
@@ -432,6 +439,7 @@ class ConventionComparison:
             return -np.inf
         segment = self._select_segments(hypothesis.applied(recording), run)
         forces = compute_joint_forces(robot, segment, segment.runs[0])
+        # Mean square difference of each joint, in N² or (N m)².
         squares = np.square(forces.needed - forces.driven).mean(axis=0)
         return float(0.5 * np.log(squares + NEGLIGIBLE_FORCE**2).sum())
 
@@ -477,7 +485,7 @@ class ConventionComparison:
             score: log-likelihood with the hypothesis.
             hypothesis: hypothesis, with a first offset. Without a free offset, it is returned as
                 it is.
-            recording: short part of the recording.
+            recording: the recording, on whose short parts the log-likelihood is computed.
 
         Returns:
             Log-likelihood and hypothesis with the best offset. If the best offset is negligible,
@@ -493,6 +501,7 @@ class ConventionComparison:
                 if shifted_score > score + MIN_REFINEMENT_GAIN:
                     score, hypothesis = shifted_score, shifted
                     break
+            # Neither direction is better.
             else:
                 step /= 2.0
         offset = max(abs(change.offset) for change in hypothesis.changes.values())
@@ -584,10 +593,11 @@ class ConventionComparison:
         names = [
             name for name in evaluator.library if name.partition("@")[0] not in excluded_effects
         ]
+        # A probe is an effect with the coefficients at which its response is computed.
         probes = [probe for name in names for probe in iterate_first_probes(evaluator, (), name)]
         selected = identify(filtered, compute_columns(filtered, probes))
         samples = int(filtered.runs.recorded.sum())
-        # 3. Filters with the effects.
+        # 3. Filters with the effects. A group has the columns of one selected effect.
         best, penalty = filtered.log_likelihood, 0.0
         for count, group in enumerate(selected.groups, start=1):
             penalty += 0.5 * len(group.column_indices) * math.log(samples) + math.log(len(names))
@@ -613,7 +623,8 @@ class ConventionComparison:
         # 5. Soft friction.
         best = max(best, _compute_log_likelihood_of_soft_friction(filtered))
         evaluator.close()
-        # 6. Regression, if its result is the larger one.
+        # 6. Regression, if its result is the larger one. A large missing force means that the
+        # corrected log is not explained.
         if self._compute_largest_missing_force(corrected) < LARGE_MISSING_FORCE:
             return best
         return max(best, selected.log_likelihood - penalty)
@@ -683,9 +694,9 @@ def _compute_log_scale_correction(
         recording: the recording, as described.
     """
     result = 0.0
-    for name, change in (
-        named_change for hypothesis in hypotheses for named_change in hypothesis.changes.items()
-    ):
+    changes = [change for hypothesis in hypotheses for change in hypothesis.changes.items()]
+    for name, change in changes:
+        # Inputs have no likelihood, and no channel of their name.
         samples = [run.channels[name] for run in recording.training() if name in run.channels]
         count = sum(int(np.isfinite(values).sum()) for values in samples)
         result += count * math.log(abs(change.scale))
@@ -716,6 +727,9 @@ def _list_similar_causes(
     Args:
         followed: the runs as described, filtered without effects.
         hypotheses: differences of the conventions.
+
+    Returns:
+        First coefficient of each effect, by name; zero where none is known.
     """
     causes: dict[str, float] = {}
     evaluator = followed.evaluator
@@ -771,7 +785,9 @@ def _compute_log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
         followed: Result of the filter without this friction.
     """
     evaluator = followed.evaluator
+    # The first joint is the one at which the filter needs a missing force most.
     joint = followed.joints_by_loss[0]
+    # Parameters with friction of several sizes.
     thetas = make_soft_friction_models(followed, evaluator.get_nominal_theta(), joint)
     if not thetas:
         return -np.inf

@@ -117,7 +117,8 @@ def _advance_inputs(run: Run, delay: float) -> Run:
         if name in run.linear:
             advanced = np.interp(shifted_times, run.times, values)
         else:
-            # Index of the last sample before; the tolerance is for stamps that differ by rounding.
+            # Index of the last sample up to the shifted time; the tolerance is for stamps that
+            # differ by rounding.
             last_indices = (
                 np.searchsorted(run.times, shifted_times + 1e-6 * delay, side="right") - 1
             )
@@ -317,6 +318,7 @@ def _generate_zero_offsets(
     position = joint.channels.get("q")
     if position is None or not joint.is_hinge:
         return
+    # Without a servo, the fixed offsets are also tried for the position alone.
     tried_offsets = position_offsets = TRIED_ZERO_OFFSETS.tolist()
     # 1. Position and command.
     if joint.servo_inputs:
@@ -384,10 +386,12 @@ def _generate_joint_orders(
         suspects: joints whose columns may be exchanged.
     """
     indices = range(len(joints))
+    # Only signals that all joints have can be exchanged between any of them.
     has_commands = all(len(joint.inputs) == 1 for joint in joints)
     quantities = [q for q in QUANTITIES if all(q in joint.channels for joint in joints)]
     suspect_indices = [i for i in indices if joints[i] in suspects]
     orders = [{one: other, other: one} for one, other in combinations(suspect_indices, 2)]
+    # Indices of the joints in the alphabetical order of their names.
     alphabetical = sorted(indices, key=lambda i: joints[i].name)
     orders += [
         {i: alphabetical.index(i) for i in indices},  # The log has the alphabetical order.
@@ -462,6 +466,8 @@ def _generate_units(
     names = [signal.name for signal in signals]
     text = join_first_names(names, MAX_NAMED)
     for unit, gain in UNITS.get(first_signal.si, {}).items():
+        # The values were multiplied by the gain of the stated unit, which is undone. A separate
+        # factor of the description (`scale`) is part of that gain, and stays.
         scale = first_signal.scale * gain / first_signal.gain
         if not math.isclose(scale, 1.0, rel_tol=SAME_UNIT_TOLERANCE):
             unit_words, stated_words = (
@@ -497,6 +503,7 @@ def _are_whole(signals: Sequence[DescribedSignal], recording: Recording) -> bool
     for run in recording.training():
         recorded = {**run.inputs, **run.channels}
         for signal in signals:
+            # The numbers as they stand in the log.
             numbers = recorded[signal.name] / signal.gain
             numbers = numbers[np.isfinite(numbers)]
             if not np.allclose(numbers, np.rint(numbers), rtol=0.0, atol=INTEGER_TOLERANCE):
@@ -587,6 +594,7 @@ def _find_likely_column(recording: Recording, channel: str) -> str:
         column for table in tables if isinstance(table, dict) for column in _list_columns(table)
     ]
     channel_table = meta.get("channels", {}).get(channel, {})
+    # Without a stated column, the column has the name of the channel.
     position_column, *_ = _list_columns(channel_table) or [channel]
     best, best_correlation = UNKNOWN_COLUMN, MIN_CORRELATION
     # The first log with the position decides.

@@ -49,6 +49,7 @@ def correct_description(
     for difference in differences:
         hypothesis = difference.hypothesis
         for kind in KINDS:
+            # A change may need the unchanged table of another signal, if two are exchanged.
             before = copy.deepcopy(corrected[kind])
             for name, change in hypothesis.changes.items():
                 if name in before:
@@ -56,6 +57,7 @@ def correct_description(
                     corrected[kind][name] = _change_scale(
                         table, units[kind][name], change, hypothesis
                     )
+        # Commands that are stamped late, in s, are moved to earlier times.
         if hypothesis.late:
             time_table = dict(corrected.get("time", {}))
             time_table["offset"] = _round_value(
@@ -89,8 +91,10 @@ def _move_to_column(
         return table
     if not is_signal:
         return {**table, "column": change.source}
+    # The table of the other signal was copied: its column, by default of that signal's name, is
+    # now stated, unless it is the default of the changed signal.
     table.setdefault("column", change.source)
-    if table["column"] == name:  # It is the default.
+    if table["column"] == name:
         del table["column"]
     return table
 
@@ -145,6 +149,7 @@ def list_changed_tables(
         differences: Differences to correct.
     """
     corrected = correct_description(meta, declared, differences)
+    # The present tables in the same form, without any correction.
     unchanged = correct_description(meta, declared, ())
     for kind in KINDS:
         names = [

@@ -64,6 +64,10 @@ def _change_run(run: Run, changes: Mapping[str, SignalChange]) -> Run:
 
     `run.before` has, by signal name, the stacked pair of time stamps and values recorded before the
     run; the values are changed like those of the run.
+
+    Args:
+        run: the run.
+        changes: changes by the name of the signal; other signals stay as they are.
     """
     signals = {**run.inputs, **run.channels}
     earlier_times = {name: times for name, (times, _) in run.before.items()}

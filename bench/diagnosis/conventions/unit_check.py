@@ -370,10 +370,12 @@ def find_wrong_units(
     if not (shares > MIN_BASE_RESIDUAL_SHARE).any():
         return None
     # 2. Promising hypotheses.
+    # RMS residual of the base model, in units of the noise; None is reported if it is infinite.
     before = _compute_residual_rms(residual, is_recorded, noise)
     known_before = before if np.isfinite(before) else None
     signals = subject.signals(evaluator.channels)
     hypotheses = list(_generate_hypotheses(signals, _list_suspected_parts(evaluator, shares)))
+    # A residual of 1 is only noise, and the rest is the excess.
     max_excess = MAX_REMAINING_SHARE * (before - 1.0)
     after_by_hypothesis: dict[UnitHypothesis, float] = {}
     alternative_texts: list[str] = []
@@ -439,6 +441,7 @@ def find_imitated_unit(
     signal_name = evaluator.available_effects[cause.effect].signal
     kind = "channels" if effect == "sensor.gain" else "inputs"
     signals = [s for s in subject.signals(evaluator.channels) if s.kind == kind]
+    # A gain of zero is not a unit, and has no reciprocal.
     if not signals or not gain:
         return None
     if not signal_name and kind == "channels":
@@ -526,6 +529,7 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
         # A failed simulation counts as an infinite residual.
         channel_residual = np.nan_to_num(residual[..., channel_index][is_recorded], nan=np.inf)
         mean_square = float(np.mean(channel_residual**2))
+        # RMS residual beyond the noise.
         excess = max(mean_square - sigma**2, 0.0) ** 0.5
         residual_ratios.append(excess / deviation if deviation > MIN_MOTION_SIGMAS * sigma else 0.0)
     return np.array(residual_ratios)
@@ -606,7 +610,8 @@ def _generate_hypotheses(
                 yield UnitHypothesis(
                     changed_signals, tuple(actual_units[s.si] for s in changed_signals)
                 )
-        # If the log was converted from this system twice, all signals have the same wrong factor.
+        # If the log was converted from this system twice, all signals have the same wrong factor,
+        # which is that of the first one: the units of a system differ by one factor.
         if len({s.si for s in related_signals}) > 1:
             si = related_signals[0].si
             specified_units = tuple(s.specified_unit for s in related_signals)
@@ -622,20 +627,27 @@ def _generate_unit_hypotheses(signals: tuple[DescribedSignal, ...]) -> Iterator[
 
     Factors that undo a conversion that was made twice are tried as well, unless they equal that of
     a unit. For a quantity without known other units, these are 1000 and 1/1000.
+
+    Args:
+        signals: one signal, or several with the same stated unit.
     """
+    # 1. Sign.
     first = signals[0]
     stated_units = (first.specified_unit,) * len(signals)
     yield UnitHypothesis(signals, stated_units, -1.0)
+    # 2. Units, by their factors to the SI unit.
     units = UNITS.get(first.si, {})
-    stated = abs(first.gain / first.scale)
+    # The gain is the product of the factor of the stated unit and a stated `scale`.
+    stated_gain = abs(first.gain / first.scale)
     tested_factors = {1.0}
     for unit, gain in units.items():
         if unit != first.specified_unit and not math.isclose(
-            gain, stated, rel_tol=SAME_UNIT_TOLERANCE
+            gain, stated_gain, rel_tol=SAME_UNIT_TOLERANCE
         ):
             yield UnitHypothesis(signals, (unit,) * len(signals))
             yield UnitHypothesis(signals, (unit,) * len(signals), -1.0)
-            tested_factors.add(gain / stated)
+            tested_factors.add(gain / stated_gain)
+    # 3. Double conversions.
     double_conversions = [1.0 / gain for gain in units.values()] if units else [1e3, 1e-3]
     for factor in double_conversions:
         if not any(math.isclose(factor, known, rel_tol=GAIN_TOLERANCE) for known in tested_factors):
@@ -766,8 +778,9 @@ def _compute_max_cost(evaluator: RunEvaluator, noise: NoiseModel, max_rms: float
     for channel_index, sigma in enumerate(noise.sigma.tolist()):
         values = evaluator.observed[..., channel_index][is_recorded[..., channel_index]]
         deviation = float(np.std(values)) if values.size else 0.0
-        moves = deviation > MIN_MOTION_SIGMAS * sigma
-        excess = MAX_RESIDUAL_SHARE * deviation if moves else np.inf
+        is_moving = deviation > MIN_MOTION_SIGMAS * sigma
+        # Largest RMS residual of the channel beyond its noise.
+        excess = MAX_RESIDUAL_SHARE * deviation if is_moving else np.inf
         # Squares of the excess and of the noise add.
         max_squares += values.size * ((excess / sigma) ** 2 + 1.0) if values.size else 0.0
     return min(max_rms**2 * float(is_recorded.sum()), max_squares)
@@ -820,16 +833,18 @@ def _test_distinctness(
     nearby_residual = min(
         residual_with_factor(1.0 / FACTOR_STEP), residual_with_factor(FACTOR_STEP)
     )
-    if 2.0 * samples * math.log(nearby_residual / after) > MIN_DISTINCT_GAIN:
+    # Twice the log-likelihood of white noise is -n log(RMS residual squared), up to a constant.
+    gain = 2.0 * samples * math.log(nearby_residual / after)
+    if gain > MIN_DISTINCT_GAIN:
         return "sharp"
     # 4. Absorbed scale.
     # A factor that is not a unit cannot be recognised for an input of arbitrary scale.
-    is_unit = hypothesis.scale == 1.0 and all(
+    is_input_unit = hypothesis.scale == 1.0 and all(
         signal.kind == "inputs" for signal in hypothesis.signals
     )
-    absorbed = (
-        is_unit
+    is_absorbed = (
+        is_input_unit
         and nearby_residual * MAX_EQUAL_RATIO > after
         and residual_with_factor(OFF_FACTOR) > MIN_RATIO_WITHOUT_INPUT * after
     )
-    return "absorbed" if absorbed else "none"
+    return "absorbed" if is_absorbed else "none"

@@ -291,8 +291,8 @@ def get_physical_limits(evaluator: RunEvaluator, index: int) -> Bounds:
 def _get_coefficient(kind: Any, name: str) -> Any:
     """Return the effect coefficient that a freed parameter of a robot's model file is fitted as.
 
-    A freed parameter is a number of the model file that the user lets the fit change. The result is
-    None for a parameter of the simulator itself.
+    A freed parameter is a number of the model file that the user lets the fit change. For a
+    parameter of the simulator itself, None is returned.
 
     Args:
         kind: class of the simulator.

@@ -88,9 +88,13 @@ class BaseModel:
         They change the best parameters only a little, so the fit starts from those of this fit,
         unless it failed or parameters were identified by prediction errors.
         """
-        is_near = np.isfinite(self.fit.fit.cost) and runs.context.identified is None
-        nearby = self.fit.fit.theta[runs.fitting.base_indices] if is_near else _get_starts(runs)
-        return BaseModel(runs, fit_base_model(runs.fitting, runs.noise, nearby))
+        can_start_from_fit = np.isfinite(self.fit.fit.cost) and runs.context.identified is None
+        initial_base = (
+            self.fit.fit.theta[runs.fitting.base_indices]
+            if can_start_from_fit
+            else _get_starts(runs)
+        )
+        return BaseModel(runs, fit_base_model(runs.fitting, runs.noise, initial_base))
 
     def widen_ranges(self) -> BaseModel:
         """Widen the ranges of base parameters that the fit leaves at a bound."""
@@ -100,8 +104,9 @@ class BaseModel:
     def freeze_unidentified(self) -> BaseModel:
         """Freeze free numbers of a robot that the data cannot identify, at their nominal values.
 
-        A system has few parameters, and would have no result without them; there the verdict
-        reports it. A note to the user names the frozen numbers.
+        A note to the user names the frozen numbers. Systems that are not robots are not treated so:
+        they have few parameters, and would have no result without them; there the verdict reports
+        that they are not identified.
         """
         if not self.is_usable:
             return self
@@ -117,7 +122,8 @@ class BaseModel:
     def shows_step_errors(self) -> bool:
         """Return whether the recording shows the discretisation error of the engine's steps.
 
-        Without a filter of the runs this is not known, and true is returned.
+        The innovations of a Kalman filter show it. Without a filter of the runs this is not known,
+        and true is returned.
         """
         runs = self.runs
         if runs.fitting.filtered_runs is None or not self.is_usable:
@@ -126,6 +132,7 @@ class BaseModel:
         from bench.diagnosis.kalman.linearised_filter import FollowedRuns
         from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
 
+        # The filter with the fitted parameters, which may be the stored one.
         theta = self.fit.fit.theta
         return shows_step_errors(FollowedRuns.get_or_follow(runs.fitting, theta, runs.noise))
 
@@ -142,10 +149,12 @@ class BaseModel:
         from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
 
         evaluator = self.runs.fitting
+        # The runs, followed by a Kalman filter; None if no filter could decide.
         followed = evaluator.filtered_runs
         if followed is not None and (followed.has_missing_force or not shows_step_errors(followed)):
             return self
         fit, noise = self.fit.fit, self.runs.noise
+        # This stores the correction in the evaluator, unless the error is too large.
         correct_discretisation(evaluator, noise, fit.theta, fit.initial_states)
         if evaluator.discretisation_correction is None:
             return self
@@ -161,16 +170,19 @@ class BaseModel:
     def refit_first_states(self) -> BaseModel:
         """Fit the first states again if the filter follows the runs and the simulation does not.
 
-        A fit to whole runs from the readings may end in a local minimum. The filter lacks no force,
-        so its first states are better starts.
+        First states are the initial positions and velocities of each run. A fit to whole runs from
+        the readings may end in a local minimum. If the filter lacks no force, its first states are
+        better starts.
         """
         runs, followed = self.runs, self.runs.fitting.filtered_runs
         if followed is None or followed.has_missing_force or not self.is_usable:
             return self
         _, residual_rms = self.rate()
+        # The simulation follows the runs down to the noise.
         if residual_rms < MIN_REFITTED_RESIDUAL:
             return self
         start = find_first_states(runs.fitting, runs.noise, self.fit.fit)
+        # No better first states were found.
         if start is None:
             return self
         return replace(self, fit=self.fit.refit(runs.fitting, runs.noise, start))
@@ -199,11 +211,12 @@ class BaseModel:
         return SEGMENT_DURATIONS[-1]
 
     def loses_orientation(self) -> bool:
-        """Return whether the simulated orientation of a recorded floating body is far from it.
+        """Return whether a simulated floating body is far from its recorded orientation.
 
         Beyond a certain error a fit does not find back; the runs are then divided into shorter
         segments.
         """
+        # Channels of the orientation, such as `q.base.yaw`.
         names = [
             f"q.{base_name}.{angle}"
             for base_name in self.runs.kind.system.base_orientations

@@ -73,10 +73,11 @@ class CauseSearch:
         # This import is needed for robots only.
         from bench.diagnosis.prediction_error.dry_friction_fits import SoftFrictionError
 
+        # 1. Stiff friction.
         try:
             result = self._find_causes(base, search, rng)
             # The search itself compares the forms of friction that it selects, but not of friction
-            # that is a free number.
+            # that is a free number of the model file, which is in the base model.
             is_comparison_needed = (
                 has_dry_friction(runs.fitting, ())
                 and not result.errors
@@ -90,6 +91,7 @@ class CauseSearch:
             if soft_model is None:
                 return result
             return self._search_with_soft_friction(base, search)
+        # 2. Soft friction.
         except SoftFrictionError as error:
             soft_result = self._search_with_soft_friction(base, search, error.start)
             if (
@@ -98,6 +100,8 @@ class CauseSearch:
                 or runs.context.search_control.is_over()
             ):
                 return soft_result
+        # 3. Stiff friction again. With `is_form_given`, the form is tested only after effects have
+        # been fitted.
         runs.context.say(STIFF_FRICTION)
         stiff_search = runs.create_search(base.fit, rng, is_form_given=True)
         _take_over(stiff_search, search)
@@ -105,7 +109,7 @@ class CauseSearch:
             return self._find_causes(base, stiff_search, rng)
         except SoftFrictionError as error:
             start = error.start
-            # A repeated soft search could only begin with another model.
+            # A soft search is repeated only from a model that the first one has not fitted.
             if start is None or frozenset(start.effects) in soft_result.search.models:
                 runs.context.say(SOFT_FRICTION)
                 return soft_result
@@ -152,12 +156,15 @@ class CauseSearch:
             rng: random generator of the search.
         """
         check = self._error_check
+        # 1. Search, unless an error is known already.
         if not check.errors:
             result = SearchResult(base, search, _search_and_decide(search, base.runs), rng)
             result = replace(result, finding=restrict_verdict(result))
+            # This stores the errors that the result shows in `check.errors`.
             check.check_result(result)
             if not check.errors:
                 return result
+        # 2. A result without causes, with the errors.
         model = search.base_model
         finding = DiagnosisResult("unknown", model, model, (), assess_lack_of_fit(search, model))
         return SearchResult(base, search, finding, rng, check.errors)
@@ -202,6 +209,7 @@ def _take_over(
     # This import is needed for robots only.
     from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 
+    # Only searches by prediction errors have filters.
     if isinstance(search, PredictionErrorSearch) and isinstance(other, PredictionErrorSearch):
         search.likely = likely
         if is_reusable:

@@ -81,8 +81,14 @@ class ContactConditions:
         simulated motion instead. Another robot with many joints keeps the linear model, with
         process noise at its contacts: the nonlinear filter, whose time grows with the square of the
         number of joints, would take hours.
+
+        Args:
+            filtered_runs: the runs, followed by a Kalman filter with the linear model. It has the
+                missing force (standard deviation of the process noise) and the typical force of
+                each joint.
         """
         force_share = float((filtered_runs.force / filtered_runs.typical).max())
         has_few_joints = len(filtered_runs.typical) <= MAX_JOINTS_OF_NONLINEAR_FILTER
+        # Negated, so that the NaN of a filter that diverged counts as wrong.
         is_wrong = not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
         return self.has_contacts_off_ground and has_few_joints and is_wrong

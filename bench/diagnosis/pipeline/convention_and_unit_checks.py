@@ -56,12 +56,14 @@ class RecordingErrorCheck:
         if not _is_checked_late(result.runs) or result.is_explained or is_over:
             return ()
         search, finding = result.search, result.finding
-        # With a wrong unit or sign, effects would leave more of the discrepancy.
+        # With a wrong unit or sign, effects would leave more of the discrepancy. A model that stays
+        # incomplete leaves more of it in any case: no set of effects was found that explains all.
         max_share = (
             MAX_EXCESS_SHARE_OF_INCOMPLETE
             if finding.is_incomplete
             else MAX_EXCESS_SHARE_WITH_RIGHT_UNITS
         )
+        # The excess is the RMS residual in units of the noise, minus one.
         base_excess = search.compute_excess_residual(search.base_model)
         if search.compute_excess_residual(finding.model) < max_share * base_excess:
             return ()
@@ -85,6 +87,7 @@ def refuse_broken_conventions(runs: SimulatedRuns) -> None:
     from bench.diagnosis.conventions.corrected_description import list_changed_tables
 
     context.search_control.begin_stage("comparing conventions of log and model")
+    # The linear model is not valid at these contacts.
     if contacts.is_on_ground:
         return
     if contacts.has_contacts and contacts.needs_nonlinear_filter(runs.nominal_filter):
@@ -94,6 +97,7 @@ def refuse_broken_conventions(runs: SimulatedRuns) -> None:
     if not differences:
         return
     remedy = "correct these signals"
+    # A recording with a description file: the message names the lines to change.
     if path.with_suffix(".toml").exists():
         _, meta = read_meta(path)
         lines = "; ".join(list_changed_tables(meta, runs.kind, differences))
@@ -109,7 +113,12 @@ def refuse_broken_conventions(runs: SimulatedRuns) -> None:
 
 
 def _is_checked_late(runs: SimulatedRuns) -> bool:
-    """Return whether units are checked only after no effect has explained the gap."""
+    """Return whether units are checked only after no effect has explained the gap.
+
+    This is the order for robots. If the runs of a robot could be filtered, but its free numbers
+    could not be identified from the prediction errors, units are checked before the search, as for
+    other systems.
+    """
     has_unidentified_base = (
         bool(runs.fitting.base_indices.size)
         and runs.context.identified is None

@@ -67,6 +67,7 @@ class HeldOutGains:
             for unit in units
             if unit in (usual_unit, *ERROR_UNITS)
         }
+        # Predictions by the effects of their model; the base model has none, and the key ().
         runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits or {}
         if runs is None or () not in held_out_fits:
             return indices[usual_unit]
@@ -100,13 +101,16 @@ class HeldOutGains:
         held_out_fits, names = finding.held_out_fits, finding.model.effects
         if runs is None or held_out_fits is None or names not in held_out_fits:
             return None
+        # Predictions of the base model, which has no effects and the key (), and of the found one.
         before, after = held_out_fits[()].simulated, held_out_fits[names].simulated
+        # Prediction with the settings of the model file, if others were chosen.
         if self.result.runs.before is not None:
             before = self.result.runs.before
         # Without a prediction of the base model there is no gap to measure.
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
             return None
         gain = self._compute_gain(runs, before, after, self.result.rng)
+        # All channels that count have the unit of the first one.
         channel = self.result.runs.fitting.simulator.channels[self._channels[0]]
         # An interval that the data do not give is None.
         base, extended, floor, share, low, high = map(to_finite_or_none, astuple(gain))
@@ -142,6 +146,7 @@ class HeldOutGains:
         if runs is None or held_out_fits is None or names not in held_out_fits:
             return None
         floor = self._noise_floor
+        # The base model has no effects, and the key ().
         before = _compute_rmse(runs, held_out_fits[()].simulated, self._channels)
         after = _compute_rmse(runs, held_out_fits[names].simulated, self._channels)
         return to_finite_or_none(float(compute_closed_share(before, after, floor)))
@@ -150,7 +155,7 @@ class HeldOutGains:
         """Compute 95 % intervals of the share of the held-out gap that single effects close.
 
         The intervals are by bootstrap. An effect with a much worse prediction than the base model
-        has none, because its share is cut off.
+        has none, because its share is set to the lower limit `MIN_REPORTED_GAIN`.
 
         Returns:
             Low and high end by effect, for effects that were simulated alone on held-out runs.

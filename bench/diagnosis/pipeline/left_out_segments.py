@@ -23,14 +23,16 @@ def leave_out_unpredictable_segments(runs: SimulatedRuns) -> SimulatedRuns:
     from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
     left_out: list[str] = []
+    # The run evaluators are those of the runs for fitting and of the held-out runs.
     for evaluator in runs.evaluators:
         theta = evaluator.get_nominal_theta()
+        # The filter of the runs for fitting is computed only once for all steps of the diagnosis.
         followed = (
             runs.nominal_filter
             if evaluator is runs.fitting
             else FollowedRuns.follow(evaluator, theta, runs.noise, max_linearisations=1)
         )
-        is_followed = followed.are_runs_followed
+        is_followed = followed.are_runs_followed  # (R,)
         if 2 * is_followed.sum() >= is_followed.size:
             left_out += [evaluator.runs[i].name for i in np.flatnonzero(~is_followed)]
     return runs.without(left_out) if left_out else runs

@@ -61,31 +61,31 @@ class ParameterEstimates:
                 # The time of an event is only known to one sample spacing.
                 half_interval = evaluator.sample_interval / 2
                 low, high = low - half_interval, high + half_interval
-            at_bound = bound_of(value, *ranges[index]) if index in intervals else None
+            is_fitted = index in intervals
+            at_bound = bound_of(value, *ranges[index]) if is_fitted else None
             # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
-            is_bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
-            plausible_range = (
-                self._get_plausible_range(index) if index in intervals else parameter.bounds
-            )
-            exceeded_range = (
-                plausible_range
-                if not is_instant(parameter) and is_unusual(value, *plausible_range)
-                else None
-            )
+            has_interval = np.isfinite(low) and np.isfinite(high) and at_bound is None
+            plausible_range = self._get_plausible_range(index) if is_fitted else parameter.bounds
+            # The time of an event has no plausible range: it may happen at any time.
+            is_outside = not is_instant(parameter) and is_unusual(value, *plausible_range)
             estimates[index] = FittedValue(
                 value,
                 parameter.unit,
-                low=low if is_bounded else None,
-                high=high if is_bounded else None,
+                low=low if has_interval else None,
+                high=high if has_interval else None,
                 at_bound=at_bound,
-                usual_range=exceeded_range,
+                usual_range=plausible_range if is_outside else None,
             )
         if evaluator.kind.has_model:
             self._add_totals(estimates)
         return estimates
 
     def _get_plausible_range(self, index: int) -> tuple[float, float]:
-        """Return the plausible range, narrower than the bounds for a robot's free numbers."""
+        """Return the plausible range of a parameter, by its index in the parameter vector.
+
+        A robot's free number, a number of its model file that is fitted, may have wide bounds; its
+        range for training is then the plausible one.
+        """
         evaluator = self.search.evaluator
         parameter = evaluator.parameters[index]
         is_free = evaluator.kind.has_model and index in evaluator.base_indices
@@ -112,12 +112,16 @@ class ParameterEstimates:
         for (effect, indices), effect_totals in zip(
             placed_effects, compute_file_totals(kind.robot, fitted_effects), strict=True
         ):
-            # The model file keeps its gravity if the bodies are gravity-compensated.
+            # The model file keeps its gravity if the bodies are gravity-compensated. The name of
+            # the coefficient, here empty, does not matter.
             is_compensated = is_gravity_compensated(effect.name, {"": numbers[indices[0]]})
+            # An effect whose coefficients are all zero changes nothing.
             if is_compensated or not any(numbers[i].value for i in indices):
                 continue
             for i, number_total in zip(indices, effect_totals, strict=True):
+                # The model file may have no number for a coefficient.
                 if number_total is not None:
+                    # The unit of the total is stated only if it differs from the estimate's.
                     unit = number_total.unit if number_total.unit != numbers[i].unit else ""
                     file_value, total = number_total.stated, number_total.total
                     numbers[i] = replace(
@@ -128,10 +132,11 @@ class ParameterEstimates:
         """Yield each fitted effect at one place, with the indices of its coefficients in theta.
 
         These are the effects of the numbers that the user freed, then those of the model. An effect
-        that acts at all places is divided into its members.
+        that acts at all places (a family) is divided into its members, one for each place.
         """
         evaluator, kind = self.search.evaluator, cast(Any, self.search.evaluator.kind)
-        # The free numbers of the user come first in theta, in the order of their effects.
+        # The free numbers of the user come first in theta, in the order of their effects. The
+        # iterator hands out the indices one after another.
         remaining_indices = iter(range(evaluator.system_parameter_count))
         for effect in kind.system.freed_effects:
             yield effect, [next(remaining_indices) for _ in effect.coefficients]
@@ -201,7 +206,7 @@ class ParameterEstimates:
             effects: names of the effects.
         """
         evaluator = self.search.evaluator
-        base = [self.values[i] for i in evaluator.base_indices.tolist()]
+        base_values = [self.values[i] for i in evaluator.base_indices.tolist()]
         indices = [i for name in effects for i in evaluator.get_coefficient_indices(name)]
-        is_at_bound = any(n.at_bound is not None and not n.is_result for n in base)
-        return all(self.values[i].is_result for i in indices) and not is_at_bound
+        is_base_at_bound = any(v.at_bound is not None and not v.is_result for v in base_values)
+        return all(self.values[i].is_result for i in indices) and not is_base_at_bound

@@ -58,7 +58,7 @@ def prepare_runs(sources: Sequence[RecordingSource], context: DiagnosisContext) 
         InputError: The recording or the simulator cannot be used for a diagnosis.
     """
     options = context.options
-    # The function given is applied to each recording before its runs are divided.
+    # `_without_inactive_drives` is applied to each recording before its runs are divided.
     recording, kind = load_joined(
         sources,
         options.system,
@@ -155,9 +155,13 @@ def _fill_lost_commands(runs: SimulatedRuns) -> SimulatedRuns:
     A logger may have lost a row whose command was sent, or the controller may have sent none, so
     that the previous command was held. A filter is run with both; the more likely one shows which.
     Held commands must be clearly likelier, by a log-likelihood for each filled row.
+
+    Returns:
+        The given runs if no row is lost or the commands were held; otherwise the filled runs.
     """
     if not runs.kind.has_model:
         return runs
+    # The note for the user is empty if no row is lost.
     filled, note = fill_lost_commands(runs.recording)
     if not note:
         return runs
@@ -191,12 +195,13 @@ def _check_sample_count(runs: SimulatedRuns) -> None:
     """
     evaluator = runs.fitting
     samples = int(np.isfinite(evaluator.observed).sum())
+    # Base parameters, and the initial states of all runs that are not known.
     unknowns = evaluator.base_indices.size + int((~evaluator.known_state_mask).sum())
     if samples < MIN_SAMPLES_PER_UNKNOWN * unknowns + MIN_EXTRA_SAMPLES:
-        least = int(MIN_SAMPLES_PER_UNKNOWN * unknowns) + MIN_EXTRA_SAMPLES
+        min_samples = int(MIN_SAMPLES_PER_UNKNOWN * unknowns) + MIN_EXTRA_SAMPLES
         raise InputError(
             f"{runs.recording.path}: too short: {samples} samples for fitting, "
-            f"expected at least {least} for {unknowns} parameters and initial states"
+            f"expected at least {min_samples} for {unknowns} parameters and initial states"
         )
 
 

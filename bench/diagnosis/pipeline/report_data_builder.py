@@ -121,6 +121,7 @@ def _assess_consistency(result: SearchResult) -> ConsistencySummary:
     Consistency means that groups of runs give the same parameters as all runs together.
     """
     search, finding = result.search, result.finding
+    # Without a complete search or an identified base model, there is nothing to compare.
     if finding.early_stop is not None or finding.unidentified_parameters:
         return ConsistencySummary()
     before = assess_consistency(search, finding.base)
@@ -173,7 +174,8 @@ def _assess_identifiability(search: EffectSearch) -> tuple[ParameterIdentifiabil
     search.release_memory()
     directions = search.get_known_directions()
     if directions is None:
-        # The base model has no effects.
+        # Scans are scores with their directions, by the effects of the model; the base model has no
+        # effects. That of an earlier fit is used if a better fit has replaced it without a scan.
         key: frozenset[str] = frozenset()
         scan = search.cached_scans.get(key) or search.superseded_scans.get(key)
         if scan is None:
@@ -198,6 +200,7 @@ def _summarise_held_out(
     # If the data do not identify the base model, it is not validated on held-out runs.
     if evaluator is None or held_out_fits is None or names not in held_out_fits:
         return None, []
+    # The base model has no effects, and the key ().
     before = held_out_fits[()].simulated
     after = held_out_fits[names].simulated
     how_validated = "left out" if result.runs.is_cross_validated else "held out"
@@ -295,6 +298,7 @@ def _warn_of_bounds(changes: Sequence[ParameterChange]) -> Iterator[str]:
                 "cause may compensate for a value beyond the bound. Check the "
                 "units and constants of the recording"
             )
+            # The second fit is not reported in addition.
             break
 
 
@@ -312,9 +316,10 @@ def _list_verdict_reasons(finding: DiagnosisResult) -> Iterator[str]:
     for cause in finding.causes:
         if cause.alternatives:
             names = [cause.effect, *cause.alternatives]
-            names_joints = any("@" in name for name in names)
+            # Effects of a robot have a place, such as `friction.coulomb@elbow`.
+            have_places = any("@" in name for name in names)
             effects_text = (
-                format_effect_set(names, "and") if names_joints else _join_effect_names(names)
+                format_effect_set(names, "and") if have_places else _join_effect_names(names)
             )
             yield (
                 f"{effects_text} have the same influence on these runs, "

@@ -30,6 +30,7 @@ def filter_simulated_runs(runs: SimulatedRuns) -> None:
     # 1. Model file.
     filtered_runs = runs.nominal_filter
     is_nonlinear = runs.contacts.needs_nonlinear_filter(filtered_runs)
+    # Innovations larger than expected mean that the filter does not follow the runs.
     if is_nonlinear or not filtered_runs.has_expected_innovations:
         if runs.contacts.has_contacts:
             # This import is needed for robots only.
@@ -65,7 +66,8 @@ def _filter_with_fitted_parameters(runs: SimulatedRuns) -> FollowedRuns:
 
     evaluator = runs.fitting
     with runs.record_widened_ranges():
-        # Long recordings are those of real robots, whose joints certainly have friction.
+        # Long recordings are those of real robots, whose joints certainly have friction: then only
+        # a fit with friction is made (`is_resisted`).
         result = identify_base(
             evaluator, runs.noise, runs.nominal_filter, is_resisted=is_long(evaluator)
         )

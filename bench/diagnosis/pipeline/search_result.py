@@ -83,6 +83,7 @@ class SearchResult:
         """
         for cause in self.finding.causes:
             others = {name for name in self.finding.model.effects if name != cause.effect}
+            # Fitted models are found by the set of their effects.
             keys = [frozenset({*others, effect}) for effect in cause.alternatives]
             competing_models = [
                 self.search.models[key] for key in keys if key in self.search.models

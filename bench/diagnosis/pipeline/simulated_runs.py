@@ -69,7 +69,10 @@ class DiagnosisContext:
             self.notes.append(note)
 
     def adopt(self, evaluator: RunEvaluator) -> None:
-        """Prepare a new run evaluator with what is known."""
+        """Prepare a new run evaluator with what all steps of the diagnosis share.
+
+        These are time limit, workers, widened ranges of base parameters, and identified parameters.
+        """
         evaluator.search_control = self.search_control
         evaluator.worker_pool = self.worker_pool
         self.worker_pool.register(evaluator)
@@ -131,11 +134,12 @@ class SimulatedRuns:
         def build_evaluator(runs: Sequence[Run]) -> RunEvaluator:
             """Build the run evaluator of some runs, with the same effects at the same indices."""
             engine, free = choose_engine(kind, context.options), list_free(kind, context.options)
-            # Hat effects are the forces of any shape by which unmodelled forces are detected.
+            # Hat effects are forces without a given form, by which unmodelled forces are detected.
             evaluator = RunEvaluator(kind, recording, runs, engine, list_hat_effects(kind), free)
             context.adopt(evaluator)
             return evaluator
 
+        # Runs for fitting: those that the recording does not hold out.
         fitting = build_evaluator(recording.training())
         floor = compute_noise_floor(fitting, recording)
         noise = NoiseModel.make_white(floor.sigma)
@@ -254,6 +258,7 @@ class SimulatedRuns:
         widened = {
             p.name: p.bounds for p in self.fitting.parameters if p.bounds != bounds_before[p.name]
         }
+        # The first run evaluator is that of the runs for fitting.
         for evaluator in self.evaluators[1:]:
             use_bounds(evaluator, widened)
         for name, (low, high) in widened.items():

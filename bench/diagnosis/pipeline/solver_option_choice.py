@@ -77,6 +77,7 @@ class RatedOptions(NamedTuple):
         # This import is needed for robots only.
         from sims.robot.integrator_settings import list_changed_options
 
+        # Names of the options that differ from the model file.
         kinds: list[Any] = [rated.model.runs.kind for rated in (self, other)]
         options, other_options = (
             list_changed_options(kind.robot, kind.numerics).keys() for kind in kinds
@@ -84,9 +85,9 @@ class RatedOptions(NamedTuple):
         gain = self.log_likelihood - other.log_likelihood
         if options == other_options:
             return not is_indistinguishable(gain)
-        return self.held_out >= other.held_out and closes_gap_alone(
-            gain, other.residual - 1.0, self.residual - 1.0
-        )
+        # A residual of 1 is only noise, and the rest is the gap.
+        gap, remaining_gap = other.residual - 1.0, self.residual - 1.0
+        return self.held_out >= other.held_out and closes_gap_alone(gain, gap, remaining_gap)
 
 
 class SolverOptionChoice:
@@ -162,10 +163,11 @@ class SolverOptionChoice:
             file_options: The options of the model file, with the base model fitted with them.
         """
         model = options.model
-        robot: Any = model.runs.kind
+        robot_kind: Any = model.runs.kind
         gain = options.log_likelihood - file_options.log_likelihood
-        self.finding, self._possible_options = OptionFinding(robot, gain), None
+        self.finding, self._possible_options = OptionFinding(robot_kind, gain), None
         model.runs.context.say("simulated with other options of the solver than the model file's")
+        # The gain on held-out runs is measured against the options of the model file.
         return replace(
             model, runs=replace(model.runs, before=file_options.model.predict_held_out())
         )
@@ -187,14 +189,15 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
     for _ in range(MAX_OPTION_ROUNDS):
         evaluator = rated.model.runs.fitting
         tried = []
-        for alternative in rank_option_alternatives(
+        alternatives = rank_option_alternatives(
             evaluator, runs.noise, rated.model.fit.fit.theta, evaluator.initial_state_guesses
-        )[:MAX_FITTED_OPTIONS]:
+        )
+        for alternative in alternatives[:MAX_FITTED_OPTIONS]:
             if runs.context.search_control.is_over():
                 break
-            robot: Any = runs.kind
+            robot_kind: Any = runs.kind
             # The runs take over the filter of the alternative before, if it has one.
-            runs = runs.with_kind(robot.with_integrator_settings(alternative.numerics))
+            runs = runs.with_kind(robot_kind.with_integrator_settings(alternative.numerics))
             if runs.fitting.filtered_runs is None:
                 filter_simulated_runs(runs)
             tried.append(RatedOptions.rate(rated.model.refit(runs)))
@@ -226,13 +229,14 @@ def _has_competing_effect(options: RatedOptions, file_options: RatedOptions) -> 
 
     runs = file_options.model.runs
     search = runs.create_search(file_options.model.fit)
-    # 1. Effects at contacts.
+    # 1. Effects at contacts. A scan simulates an effect with several coefficients.
     lowest_squares = find_lowest_scan(search)
     if file_options.residual > MAX_LINEAR_RESIDUAL:
         return lowest_squares < MAX_COMPETING_SQUARES_RATIO * options.model.fit.fit.cost
     # 2. Other effects.
     exclude_laws_with_many_shapes(search)
     model = search.base_model
+    # Scores are gains in twice the log-likelihood.
     score = float(search.score_missing_effects(model).score.max(initial=0.0))
     # 3. Gains.
     squares = np.square(search.compute_residual(model.fit) / runs.noise.sigma).sum()

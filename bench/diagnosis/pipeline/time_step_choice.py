@@ -82,7 +82,8 @@ class TimeStepChoice:
         shows_errors = model.shows_step_errors()
         if not shows_errors and not file_excess > MIN_TESTED_EXCESS:
             return model
-        # Copies of a tee share the refinements that were simulated, for `reconsider`.
+        # A refinement is a finer step with its simulated error. The generator simulates each when
+        # it is needed; copies of a tee share those that were simulated, also with `reconsider`.
         (refinements,) = tee(find_step_refinements(runs.fitting, runs.noise), 1)
         first = next(copy(refinements), None)
         min_error = 0.0 if shows_errors else MIN_ERROR_SHARE * residual_rms
@@ -102,8 +103,9 @@ class TimeStepChoice:
             log_likelihood, residual_rms = finer.rate()
             gain = log_likelihood - file_log_likelihood
             if not closes_gap_alone(gain, file_excess, residual_rms - 1.0):
-                # If the step is exact, a missing effect may affect both models: `reconsider`
-                # compares them with it. Otherwise only an exact step is tried next.
+                # A step that is accurate enough for a residual of zero is exact. Then a missing
+                # effect may affect both models, and `reconsider` compares them with it. Otherwise
+                # only an exact step is tried next.
                 if refinement.is_accurate_enough(0.0):
                     break
                 residual_rms = 0.0
@@ -133,7 +135,7 @@ class TimeStepChoice:
         # the file's step.
         if not finding.causes and (self.finding is not None or finding.verdict == "adequate"):
             return result
-        # 1. Step of the file.
+        # 1. Step of the file. Its runs are stored only if `choose` took a finer step.
         if self._file_runs is not None:
             file_rating = _rate_best_subset(self._file_runs, result)
             if is_clearly_better(file_rating, result.rate()):
@@ -203,7 +205,8 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
     names, fit = result.finding.model.effects, result.finding.model.fit
     evaluator, base = runs.fitting, result.searched_base.fit
     starts, has_few_effects = [], len(names) <= MAX_SUBSET_EFFECTS
-    for count in range(0 if has_few_effects else len(names), len(names) + 1):
+    min_count = 0 if has_few_effects else len(names)
+    for count in range(min_count, len(names) + 1):
         for subset in combinations(names, count):
             # Coefficients of omitted effects are zero, as in the nominal parameters.
             theta = fit.theta.copy()
@@ -240,7 +243,8 @@ def is_clearly_better(file: tuple[float, float], other: tuple[float, float]) -> 
         other: The two values with a finer step or other options. Far from the noise floor,
             autocorrelated residuals bias the likelihood, so the residual must be smaller too.
     """
-    (file_merit, file_excess), (other_merit, other_excess) = file, other
-    return not is_indistinguishable(other_merit - file_merit) and improves_held_out(
-        (file_merit, other_merit), (file_excess, other_excess)
+    (file_likelihood, file_excess), (other_likelihood, other_excess) = file, other
+    # `improves_held_out` is the rule for held-out runs; it is applied to the fitted runs here.
+    return not is_indistinguishable(other_likelihood - file_likelihood) and improves_held_out(
+        (file_likelihood, other_likelihood), (file_excess, other_excess)
     )

@@ -66,7 +66,12 @@ def build_causes(result: SearchResult) -> tuple[Cause, ...]:
 
 
 def restrict_verdict(result: SearchResult) -> DiagnosisResult:
-    """Return the finding with the verdict that its numbers and the fitted models allow."""
+    """Return the finding with the verdict that its numbers and the fitted models allow.
+
+    1. A missing effect that only linear scores suggest, and that fits refute, does not count: the
+       verdict becomes ``adequate``.
+    2. The verdict becomes weaker if the data do not determine the coefficients of the causes.
+    """
     finding = result.finding
     if finding.verdict == "unknown" and _is_refuted(result):
         return replace(finding, verdict="adequate")
@@ -97,7 +102,8 @@ def _is_refuted(result: SearchResult) -> bool:
         if model.penalised_log_likelihood > search.base_model.penalised_log_likelihood
     ]
     excess = _compute_held_out_excess(result)
-    # The base model alone must leave no large gap on held-out runs.
+    # The base model alone must leave no large gap on held-out runs. Without effects, the excess is
+    # the same before and after.
     has_held_out_gap = excess is not None and verdict_rules.misses_held_out_gap(excess, excess)
     if not extended_models or has_held_out_gap:
         return False
@@ -131,6 +137,8 @@ def _list_candidates(search: EffectSearch, gains: HeldOutGains) -> tuple[Candida
         single_effect_model = search.models.get(frozenset({effect}))
         if single_effect_model is not None:
             score = max(score, float(single_effect_model.likelihood.value - base))
+        # The p-value compares the score with those that noise alone reaches, each minus a high
+        # quantile of such scores of its effect.
         score_above_null = np.array([score - scores.null_quantiles[i]])
         p_value = float(
             np.clip(estimate_tail_p_value(scores.null_scores, score_above_null), 0.0, 1.0)
