@@ -312,7 +312,7 @@ class ConventionComparison:
         if not filtered_runs.has_expected_innovations:
             return self._generator.joints
         coordinates = self.subject.kind.system.coordinates
-        # Forces at joints come first; forces at contacts or floating bodies may follow.
+        # Forces at joints come first, and those of floating bodies follow.
         relative_missing_forces = (filtered_runs.force / filtered_runs.typical)[: len(coordinates)]
         largest = float(relative_missing_forces.max())
         # `missing_forces` is the result of a significance test for each force.

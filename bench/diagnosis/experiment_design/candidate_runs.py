@@ -319,6 +319,7 @@ def _compute_command(form: str, times: Array, step: float, rng: np.random.Genera
     """
     run_fraction = times / (times[-1] or 1.0)
     if form == "ramps up and down":
+        # One period of a triangle wave.
         return np.asarray(2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * run_fraction)))
     if form == "holds":
         # Levels alternate with a large change each time, so that friction becomes visible.
@@ -398,9 +399,9 @@ def _get_first_run(evaluator: RunEvaluator, limits: StatedLimits) -> ChangedRun:
 
 
 def _get_rest_state(evaluator: RunEvaluator, limits: StatedLimits) -> Array:
-    """Return the initial state of the first run, at rest and within joint ranges.
+    """Return the initial state (s,) of the first run, at rest and within joint ranges.
 
-    A robot cannot be started in motion.
+    All rates are zero, because a robot cannot be started in motion.
 
     Args:
         evaluator: run evaluator of the runs to which models are fitted.
@@ -524,7 +525,8 @@ def _compute_largest_factor(signal: Array, limits: Interval) -> float:
     set.
     """
     extremes = float(signal.min()), float(signal.max())
-    # No factor reaches a limit of the opposite sign.
+    # The smallest value is compared with the lower limit, the largest one with the upper limit. No
+    # positive factor reaches a limit of the opposite sign.
     factors = [
         limit / extreme
         for extreme, limit in zip(extremes, limits, strict=True)

@@ -88,6 +88,7 @@ def propose_discriminating_run(
     ):
         discrimination, best_run = best
         description, change = best_run.says, best_run.change
+        # Only the limits exclude a run that distinguishes the models.
         largest_discrimination, _ = runs_by_discrimination[0]
         is_limited = discrimination < MIN_DISCRIMINATION_SIGMAS <= largest_discrimination
     # 3. Description.
@@ -135,9 +136,11 @@ def _find_first_within_limits(
     for discrimination, run in runs:
         if discrimination < MIN_DISCRIMINATION_SIGMAS:
             return discrimination, run
+        # The check of the limits needs no plan, only scenario and initial state.
         candidate = CandidateRun(RunPlan(), run.says, run.scenario, run.states)
         if all(all(limits(model, [candidate])) for model in models):
             return discrimination, run
+    # No run is within the limits: a difference of zero means that none is proposed.
     _, most_different_run = runs[0]
     return 0.0, most_different_run
 

@@ -364,6 +364,14 @@ class RunRanker:
         1. Simulate the prediction of the true model.
         2. Propose a step from the linearisation.
         3. Accept it if the cost decreases, otherwise increase the damping.
+
+        Args:
+            run: run that could be recorded.
+            true_model: model that is taken as true, with its information from the present runs.
+            competing_model: model that is fitted to its prediction.
+
+        Returns:
+            The discrimination in units of the noise variance: the lowest cost of the fit.
         """
         # 1. Prediction.
         fit = competing_model.model.fit
@@ -371,6 +379,7 @@ class RunRanker:
         target = self._whiten(simulated)[0]
         theta = fit.theta.copy()
         initial_state = run.states.copy()
+        # Parameters minus their estimates from the present data, in units of `spread`.
         deviation = np.zeros(fit.free_indices.size)
         linearisation, damping = self._linearise_run(run, competing_model, theta), FIRST_DAMPING
         if linearisation is None or not np.isfinite(target).all():
@@ -475,6 +484,7 @@ def _compute_remaining_difference(
         [linearisation.parameter_jacobian, linearisation.state_jacobian], axis=1
     )
     normal, right_hand_side = columns.T @ columns, columns.T @ difference
+    # The present data hold the parameters near their estimates: C^-1 in eq. (1).
     normal[:parameter_count, :parameter_count] += information.inverse
     right_hand_side[:parameter_count] -= information.inverse @ deviation
     damped = normal + damping * np.diag(np.diagonal(normal)) + RIDGE * np.eye(len(normal))
@@ -497,7 +507,7 @@ def _compute_information_gain(
         information: information of the present runs on the parameters.
     """
     basis, _ = np.linalg.qr(linearisation.state_jacobian)
-    # (I - B B^+) J
+    # (I - B B^+) J: the initial state of the run, which is unknown, could explain the other part.
     projected_jacobian = linearisation.parameter_jacobian - basis @ (
         basis.T @ linearisation.parameter_jacobian
     )

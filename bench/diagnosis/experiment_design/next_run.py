@@ -141,7 +141,7 @@ def design_next_run(
         evaluated_plans.update(new_plans)
         ranked_runs = [*ranked_runs, *ranker.rank_runs([rig.make_run(plan) for plan in new_plans])]
     ranked_runs = _evaluate_fully(ranker, ranked_runs)
-    # 3. Longer runs.
+    # 3. Longer runs. The best run is the first one.
     if ranked_runs and _may_longer_run_help(ranked_runs[0], max_seconds / seconds):
         longer_rig = RigModel(models.evaluator, max_seconds)
         plans = [run_value.run.plan for run_value in ranked_runs[:PLANS_TESTED_FOR_LENGTH]]
@@ -163,10 +163,12 @@ def _may_longer_run_help(best: RunValue, length_factor: float) -> bool:
         best: the best run, with the discrimination of each pair of models.
         length_factor: duration of the longest allowed run, in durations of this run.
     """
+    # The values of a run are a matrix over models, or one gain of information.
     has_pairs = best.values.ndim == 2
     if length_factor <= 1.0 or not has_pairs:
         return False
     discrimination = symmetrise_discrimination(best.values)
+    # Zero is the diagonal, or a pair that cannot be simulated on this run.
     undistinguished = discrimination[
         (discrimination > 0) & (discrimination <= DISCRIMINATION_THRESHOLD)
     ]
@@ -186,6 +188,7 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
     """
     ranked = sorted(runs, key=get_sort_key)
     for _ in range(ranker.max_exact_evaluations):
+        # Only the best plans are varied or proposed, so only they are evaluated.
         linearised_indices = [
             index
             for index, run_value in enumerate(ranked[:PLANS_VARIED_PER_ROUND])

@@ -131,6 +131,7 @@ class RigLimits:
         # The simulator of the fit returns the recorded channels only.
         simulator = evaluator.make_observing_simulator(self.monitored_channels, model.effects)
         try:
+            # This simulator has the effects of the model only, so its vector is shorter.
             theta = np.array([[values.get(p.name, 0.0) for p in simulator.parameters]])
             # Constants that the fit estimated as parameters.
             freed_constants = {c.name: values[c.name] for c in evaluator.freed_constants}
@@ -212,6 +213,7 @@ class RigLimits:
             if not np.isfinite(values).all():
                 return False
             low, high = self.bounds[name]
+            # A share of an infinite limit would be infinite.
             is_limited = np.isfinite([low, high]).all()
             tolerance = ROUNDING_TOLERANCE * max(abs(low), abs(high)) if is_limited else 0.0
             if values.min() < low - tolerance or values.max() > high + tolerance:

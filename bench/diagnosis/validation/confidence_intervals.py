@@ -88,7 +88,7 @@ def compute_central_jacobian(
     lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
     # A parameter at a bound moves by less than its step. Row j has changed parameter j, so the
-    # actual widths are on the diagonal.
+    # actual widths are on the diagonal of these (q, q) values of both sides.
     lower, upper = theta[:, :parameter_count, fit.free_indices]
     parameter_widths = np.diagonal(upper - lower)
     widths = np.concatenate([parameter_widths, 2.0 * steps[parameter_count:]])
@@ -185,6 +185,7 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
         parameter_curvature, fisher_blocks.cross, fisher_blocks.states
     )
     covariance = invert_scaled(parameter_curvature, schur_complement)
+    # A single run has no scatter.
     if not models.has_contact_jumps or len(fisher_blocks.parameters) == 1:
         return covariance
     # Only robots on the ground need this import, which takes long.
@@ -192,8 +193,10 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
 
     gradients = _compute_run_scores(models, model, fisher_blocks)
     count = len(gradients)
-    scatter_variances = np.square(gradients @ covariance).sum(axis=0) * count / (count - 1)  # (2)
-    # Few runs estimate their scatter poorly.
+    # A row is the change of the parameters by which one run contributes to the fit.
+    changes_by_run = gradients @ covariance
+    scatter_variances = np.square(changes_by_run).sum(axis=0) * count / (count - 1)  # (2)
+    # Few runs estimate their scatter poorly: quantile of Student's t instead of the normal one.
     scatter_variances *= np.square(stdtrit(count - 1, 0.975) / Z95)
     variances = np.maximum(np.diagonal(covariance), np.finfo(float).tiny)
     factors = np.sqrt(np.maximum(scatter_variances / variances, 1.0))
@@ -220,7 +223,9 @@ def _compute_run_scores(models: ModelSet, model: FittedModel, blocks: FisherBloc
     whitened = whiten(residual, models.observed_mask, blocks.noise).reshape(len(residual), -1, 1)
     gradients = np.matmul(blocks.jacobian.transpose(0, 2, 1), whitened)
     q = blocks.parameters.shape[1]
+    # A'e and B'e of each run.
     parameter_gradients, state_gradients = gradients[:, :q], gradients[:, q:]
+    # (B'B + diag sigma_0^-2)^-1 B'e, the step of the initial states alone.
     state_steps = np.linalg.solve(blocks.states, state_gradients)
     scores: Array = (parameter_gradients - blocks.cross @ state_steps)[..., 0]
     return scores
@@ -241,12 +246,12 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     """
     diagonal = np.diagonal(parameter_curvature)
     scale = np.sqrt(np.maximum(diagonal, MIN_CURVATURE))
-    unit_products = np.outer(scale, scale)
-    scaled = schur_complement / unit_products
+    scale_products = np.outer(scale, scale)
+    scaled = schur_complement / scale_products
     values, vectors = np.linalg.eigh(scaled)
     # A pseudo-inverse would give an unidentified direction no variance at all.
     inverse = (vectors / np.maximum(values, MIN_EIGENVALUE)) @ vectors.T
-    result: Array = inverse / unit_products  # (1)
+    result: Array = inverse / scale_products  # (1)
     return result
 
 
@@ -327,7 +332,7 @@ def compute_intervals(
     replaced by NaN.
 
     Args:
-        models: Models with the run evaluator.
+        models: Models of the runs, with the run evaluator to which they are fitted.
         model: Fitted model.
 
     Returns:

@@ -46,6 +46,7 @@ class CrossValidation(Validation):
     @property
     def simulations(self) -> int:
         """Number of simulations made for the folds alone."""
+        # The folds are a cached property, which may not be computed yet.
         if "_run_folds" not in self.__dict__:
             return 0
         return sum(
@@ -55,6 +56,7 @@ class CrossValidation(Validation):
 
     def close(self) -> None:
         """Close the simulators of the folds; the run evaluator of all runs stays open."""
+        # The folds are a cached property, which may not be computed yet.
         if "_run_folds" in self.__dict__:
             for fold in self._run_folds:
                 fold.fitted_runs.close()

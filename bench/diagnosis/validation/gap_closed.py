@@ -76,10 +76,12 @@ def compute_held_out_gain(
         resamples_segments: Whether the bootstrap draws segments of the runs instead of whole runs;
             two or three runs are too few to draw from.
     """
-    # Each part is a run or a segment.
+    # Each row is a part, a run or a segment, with the squared errors of both models and the number
+    # of samples.
     sums = _sum_squared_errors(evaluator, before, after, channels, resamples_segments)
     rms_before, rms_after = _compute_rms_errors(sums.sum(axis=0))
     part_count = len(sums)
+    # A resample draws as many parts as there are, with replacement.
     drawn_parts = rng.integers(part_count, size=(BOOTSTRAP_RESAMPLES, part_count))
     resampled = sums[drawn_parts].sum(axis=1)
     shares = compute_closed_share(*_compute_rms_errors(resampled), floor)

@@ -154,6 +154,7 @@ class HeldOutRuns(Validation):
         """
         # 1. All models.
         guess = self.evaluator.initial_state_guesses
+        # No effect is named, because no coefficient is fitted; effects act by those in theta.
         starts = [FitStart((), theta, guess) for theta in thetas]
         is_filtered = self.evaluator.filtered_runs is not None and not is_staged
         fits = self._fit_initial_states(
@@ -214,8 +215,8 @@ class HeldOutRuns(Validation):
             stages: share of the runs and maximum number of iterations, one stage after another.
         """
         nearest_fit = _find_lowest_cost_fit(fits)
-        # The comparison is negated because the cost of a failed fit may be NaN.
         limit = REFIT_SQUARES_RATIO * nearest_fit.cost
+        # The comparison is negated because the cost of a failed fit may be NaN.
         far_indices = [i for i, fit in enumerate(fits) if not fit.cost < limit]
         starts = [
             replace(fits[i].make_start(), initial_states=nearest_fit.initial_states)
@@ -297,6 +298,7 @@ class HeldOutRuns(Validation):
             fits: fit of each model.
         """
         first_stage, *later_stages = HORIZON_STAGES
+        # The last stage fits whole runs.
         whole_runs = HORIZON_STAGES[-1]
         continued_fits = _select_nearer_fits(fits, self._continue_about_best(fits, [whole_runs]))
         lowest_cost, continued_cost = (
@@ -305,6 +307,8 @@ class HeldOutRuns(Validation):
         if lowest_cost - continued_cost < MIN_SQUARES_DECREASE:
             return continued_fits
         staged_fits = self._fit_initial_states(starts, [first_stage])
+        # Whole runs are the last of the stages, and are fitted twice: the second fit has
+        # derivatives at the result of the first one.
         for stage in (*later_stages, whole_runs):
             staged_fits = self._continue_about_best(staged_fits, [stage])
         return _select_nearer_fits(continued_fits, staged_fits)

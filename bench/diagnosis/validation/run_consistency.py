@@ -370,7 +370,7 @@ def _find_trend_covariate(
         grouping: the groups of runs, such as logs.
         consistency: estimates of the parameter from each group.
     """
-    # 1. Groups by a constant.
+    # 1. Groups by a constant. Their trend with it is known already.
     if grouping.by not in ("run", "log"):
         trend = consistency.trend
         if trend is None or trend.p_value >= SIGNIFICANCE_LEVEL:
@@ -517,6 +517,7 @@ def _test_parameters(
         gradients: (R, q) g_r, the gradient of each run's log-likelihood by the parameters.
     """
     joint_errors = _compute_errors(_invert(curvatures))
+    # Step and standard errors (q,) of each group.
     steps, errors = [], []
     for runs in grouping.runs:
         group_covariance = _invert(curvatures[list(runs)])
@@ -527,6 +528,7 @@ def _test_parameters(
     for column, index in enumerate(model.fit.free_indices.tolist()):
         parameter, value = evaluator.parameters[index], float(model.fit.theta[index])
         low, high = parameter.bounds
+        # Scale of the parameter, to which the width of an interval is compared.
         size = max(high - low, abs(value))
         group_estimates, covariate_values = [], []
         for name, group_steps, group_errors, covariate_value in zip(
@@ -609,6 +611,9 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
     - If it is larger, the error of the slope is multiplied by the square root of the reduced
       chi-squared (Birge ratio). It is then estimated, so the p-value is that of Student's t.
 
+    With the weights w, the estimates x, and the covariate z minus its weighted mean, the slope is
+    sum w z x / sum w z^2.
+
     Args:
         group_estimates: Estimate and standard error of each group.
         covariate_values: Value of the covariate in each group, such as the load.
@@ -619,7 +624,9 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
     centred = covariate_values - weights @ covariate_values / weights.sum()
     spread = float(weights @ centred**2)
     slope = float(weights @ (centred * values)) / spread
-    residual = values - weights @ values / weights.sum() - slope * centred
+    # Scatter about the line.
+    weighted_mean = weights @ values / weights.sum()
+    residual = values - weighted_mean - slope * centred
     degrees_of_freedom = len(group_estimates) - 2
     mean_square = float(weights @ residual**2) / degrees_of_freedom
     error = float(np.sqrt(max(mean_square, 1.0) / spread))
