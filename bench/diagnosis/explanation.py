@@ -90,8 +90,9 @@ class Explanation:
     def write(self, folder: str | Path, *, pdf: bool = False, ranges: bool = False) -> list[Path]:
         """Write verdict.json, extended.toml, the figures and report.html: all of them or none.
 
-        For several runs apart.csv is written too, and for a robot extended.xml, and extended.urdf
-        if the robot comes from a URDF; they follow extended.toml.
+        For several runs apart.csv is written too (whether they agree on each parameter), and for a
+        robot extended.xml, and extended.urdf if the robot comes from a URDF; they follow
+        extended.toml.
 
         A missing folder is created; existing files with these names are replaced.
 
@@ -159,6 +160,7 @@ class Explanation:
     def _report_data(self) -> DiagnosisReportData:
         """Report data, with the changes that the diagnosis makes to a robot's model file."""
         files = self._robot_files
+        # No file was written, so there are no changes to show.
         if not files.contents:
             return replace(self.story, unwritable_causes=files.notes)
         return replace(

@@ -48,6 +48,8 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
     # Models with all meshes are compiled several times, which needs the memory of the search.
     release_free_memory()
     causes, left_out = select_written_causes(collect_causes(extended), kind.robot.base_joints)
+    # The simulator has slides and hinges in place of floating joints whose pose is recorded; the
+    # written file has the floating joints again.
     robot = restore_floating_joints(kind.robot)
     written_files = write_model_files(robot, causes, extended.title)
     try:
@@ -80,7 +82,7 @@ def select_written_causes(
     - Options of the integrator are always written.
     - Effects at the coordinates of a floating body are left out, as the file does not have them.
     - Numbers at a bound of their range, or without an interval, are not results and are left out,
-      with all coefficients of their effect at that place.
+      with all coefficients of their effect at that place. Zero at a lower bound is a result.
 
     Args:
         causes: Coefficients by effect. A coefficient of an effect at several places (a family) is
@@ -271,10 +273,12 @@ def _compare_blocks(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFil
     elements = list(_pair_with_comments(new))
     lines_before = list(old)
     if len(old) != len(elements):
+        # All old elements stand before the first new one.
         lines_before = ["\n".join(old), *[""] * (len(elements) - 1)]
     if elements:
         for line_before, (line, comment) in zip(lines_before, elements, strict=True):
             yield ModelFileChange(_format_element(line), line_before, line, comment)
+    # The block was removed.
     elif old:
         yield ModelFileChange(_format_element(old[0]), "\n".join(old), "")
 
@@ -287,7 +291,11 @@ def _list_commented_elements(lines: Sequence[str]) -> Iterator[ModelFileChange]:
 
 
 def _pair_with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield each XML element (a line) with the comments before it that explain a fitted value."""
+    """Yield each XML element (a line) with the comments before it that explain a fitted value.
+
+    Args:
+        lines: tags and comments of the file, one each; a comment precedes its element.
+    """
     comments: list[str] = []
     for line in lines:
         match = _COMMENT.fullmatch(line)

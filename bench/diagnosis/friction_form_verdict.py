@@ -180,6 +180,7 @@ def _refit_with_other_form(
     correct_discretisation(
         evaluator, models.noise, refitted_model.fit.theta, refitted_model.fit.initial_states
     )
+    # Otherwise the fit without the correction, which is known, might be returned again.
     other_models.models.clear()
     return other_models.fit_one(refitted_model.fit.make_start())
 
@@ -192,8 +193,10 @@ def get_stateless_friction(evaluator: RunEvaluator, name: str) -> str:
         name: Name of the effect, with its place on a robot: ``drag.linear@elbow``.
     """
     effect = evaluator.available_effects[name]
+    # An effect with a state of its own, such as the bend of bristles, has the hook "hidden".
     if effect.hook != "hidden":
         return name
+    # The simpler effects to which it reduces if some of its coefficients are zero.
     for contained_name in effect.contains:
         contained_effect = evaluator.available_effects.get(contained_name)
         if contained_effect is not None and is_dry_friction(contained_effect):
@@ -226,8 +229,9 @@ def replace_by_stateless_friction(
         stateless_names.append(stateless_name)
         if stateless_name != name:
             # The first coefficient of both effects is the limit of the friction force.
-            limit, *_ = coefficient_indices = evaluator.get_coefficient_indices(name)
-            stateless_limit, *_ = evaluator.get_coefficient_indices(stateless_name)
-            theta[stateless_limit] += theta[limit]
+            coefficient_indices = evaluator.get_coefficient_indices(name)
+            limit_index = coefficient_indices[0]
+            stateless_limit_index = evaluator.get_coefficient_indices(stateless_name)[0]
+            theta[stateless_limit_index] += theta[limit_index]
             theta[coefficient_indices] = 0.0
     return tuple(dict.fromkeys(stateless_names)), theta

@@ -226,6 +226,7 @@ class _IdentifiabilityAssessment:
         """
         curvature = self.parameters.T @ self.parameters
         covariance = invert_scaled(curvature, curvature)
+        # Standard error of each parameter.
         errors = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         errors = np.where(np.diagonal(curvature) > 0, errors, np.inf)
         correlations = np.abs(covariance / np.outer(errors, errors))
@@ -279,6 +280,7 @@ class _IdentifiabilityAssessment:
             # 2. The most sensitive direction.
             for column, norm, k in zip(columns.T, norms.tolist(), block, strict=True):
                 probe = candidates[k]
+                # A switching effect is only assessed at its tried sizes.
                 if probe.effect in switching_effects and not probe.is_single_size:
                     continue
                 key = probe.effect, probe.coefficient_index
@@ -304,6 +306,7 @@ class _IdentifiabilityAssessment:
                 if other_effect != name and other.norm > 0
             ]
             label = name
+            # An effect with several coefficients is named together with the coefficient.
             if sum(effect == name for effect, _ in most_sensitive) > 1:
                 label += f" {parameter.name.rpartition('.')[2]}"
             identifiability = _classify_parameter(label, False, parameter, half_width, confounders)
@@ -350,6 +353,7 @@ def _classify_parameter(
             kept.
     """
     low, high = parameter.bounds
+    # Width of the interval as a share of the range.
     share = 2.0 * half_width / max(high - low, 1e-300)
     level: IdentifiabilityLevel = "not identifiable"
     if share <= MAX_WEAK_WIDTH:
@@ -471,6 +475,7 @@ def freeze_unidentified_parameters(
         frozen_indices = [index_by_name[name] for name in unidentified if name in index_by_name]
         if not frozen_indices:
             break
+        # The worse half, rounded up.
         if iteration < MAX_REFITS - 1:
             frozen_indices = frozen_indices[: (len(frozen_indices) + 1) // 2]
         base = replace(

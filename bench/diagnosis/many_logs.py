@@ -213,6 +213,9 @@ def place_of(name: str) -> str:
 def build_number_table(rows: Sequence[LogResult]) -> pd.DataFrame:
     """Build a table with one row per number of each cause, those of the commonest cause first.
 
+    A number is a fitted coefficient of a cause, with its 95 % interval `low` to `high`. The column
+    `what` names cause, coefficient and unit; numbers with equal text are shown together.
+
     Args:
         rows: results of the diagnoses, one for each log.
     """
@@ -276,6 +279,7 @@ def list_logs(paths: Sequence[Path], out: Path, settings: Mapping[str, Any]) -> 
         InputError: A file does not exist.
     """
     settings_text = repr(sorted((key, str(value)) for key, value in settings.items()))
+    # The content of the model file counts, too: it may change without its path.
     if settings.get("model") is not None:
         settings_text += compute_content_digest(Path(settings["model"])).hex()
     return [
@@ -311,6 +315,7 @@ def explain_batch(
     Returns:
         Results in the order of the logs.
     """
+    # Results of an earlier call that are still valid are reported first.
     results_by_log = _load_previous_results(out, logs)
     for row in results_by_log.values():
         report_result(row)

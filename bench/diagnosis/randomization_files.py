@@ -40,7 +40,7 @@ def render_mujoco_playground_code(
     """
     sentences = dict(describe_ranges(ranges))
     # Setting the mass also scales the inertia, and setting the size of gravity its components, so
-    # inertia and components are set afterwards.
+    # inertia and components are set afterwards. A number without a field of the model has no code.
     with_fields = sorted((r for r in ranges.ranges if r.fields), key=_is_last)
     fields = dict.fromkeys(
         name for number_range in with_fields for name in _list_fields(number_range)

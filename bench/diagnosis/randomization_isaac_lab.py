@@ -87,13 +87,17 @@ def _build_terms(
         ranges: ranges to write.
         sentences: comment for each range.
         robot: model of the robot.
+
+    Returns:
+        The terms, and the ranges without a term.
     """
+    # Ranges by effect, then by the name of their joint, body or actuator.
     by_effect: dict[str, dict[str, list[RandomizationRange]]] = {}
     for number_range in ranges.ranges:
         by_effect.setdefault(number_range.effect, {}).setdefault(number_range.name, []).append(
             number_range
         )
-    # 1. Joints.
+    # 1. Joints. These effects have one coefficient, and so one range at each place.
     terms: list[Term] = []
     for effect, key, further_notes in (
         ("friction.coulomb", "friction_distribution_params", [FRICTION_NOTE]),
@@ -187,6 +191,7 @@ def _make_gain_terms(
     for joint in dict.fromkeys([*passive_damping, *_group_by_joint(robot, damping)]):
         actuators = [actuator.name for actuator in robot.actuators if actuator.joint == joint]
         gains = [_convert_gain_to_joint(robot, damping, name, DAMPING_COLUMN) for name in actuators]
+        # Damping of the joint itself.
         joint_ranges = passive_damping.get(joint, [])
         if joint_ranges:
             gains.append(_get_ends(joint_ranges[0]))
@@ -236,6 +241,7 @@ def _convert_gain_to_joint(
     if name in ranges:
         low, high = _get_ends(ranges[name][0])
         return squared_gear * low, squared_gear * high
+    # MuJoCo stores the negative gain.
     gain_in_file = -squared_gear * float(robot.compiled.actuator_biasprm[actuator_id, bias_column])
     return gain_in_file, gain_in_file
 

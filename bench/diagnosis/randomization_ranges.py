@@ -133,6 +133,7 @@ def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> R
     # This import is needed for robots only.
     from sims.robot.fitted_causes import expand_families
 
+    # 1. Effects that may have ranges.
     unambiguous_effects = {cause.effect for cause in answer.causes if not cause.alternatives}
     left_out = [
         f"{cause.effect} is not in the ranges: these data cannot distinguish it from "
@@ -152,6 +153,7 @@ def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> R
         for name, numbers in causes_by_name.items()
         for cause in expand_families(kind.robot, {name: numbers})
     ]
+    # 2. Ranges.
     ranges = []
     totals = _Totals(kind, [cause for _, cause in causes])
     for cause_index, (name, cause) in enumerate(causes):
@@ -166,6 +168,7 @@ def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> R
             # A coefficient of a cause that was never fitted needs no reason.
             elif is_free or fitted.value or fitted.at_bound:
                 left_out.append(reason)
+    # 3. Notes.
     if ranges and not any(number_range.fields for number_range in ranges):
         left_out.append(NO_FIELD)
     if not ranges:
@@ -270,7 +273,8 @@ def _convert_to_range(
     assert fitted.low is not None
     assert fitted.high is not None
     effect = totals.effects[cause_index]
-    # Elements of the compiled model for each coefficient of the effect, if there are any.
+    # Elements of the compiled MuJoCo model (`mjModel`) that each coefficient of the effect changes,
+    # if there are any.
     fields = model_fields(robot, cause.effect, cause.place)
     names = [c.name for c in effect.coefficients]
     own_fields = tuple(fields[names.index(entry.coefficient)]) if fields else ()

@@ -238,12 +238,14 @@ def _find_saturation(evaluator: RunEvaluator) -> Mask:
     """
     mask = np.zeros(evaluator.observed.shape[:2], dtype=bool)
     for run_mask, run_data in zip(mask, evaluator.prepared_runs, strict=True):
+        # Only the first input, if there is one.
         for signal in list(run_data.scenario.inputs.values())[:1]:
             size = np.abs(signal)
             largest = max(float(size.max()), 1e-300)
             run_mask[: signal.size] = (size >= SATURATION_SHARE * largest) & (size > 0)
     lasting = _find_lasting_stretches(mask)
-    return lasting if lasting.mean() < 0.5 else np.zeros_like(mask)
+    is_exceptional = lasting.mean() < 0.5
+    return lasting if is_exceptional else np.zeros_like(mask)
 
 
 def compute_residual_profiles(
@@ -332,6 +334,7 @@ def _compute_bin_edges(values: Array) -> Array | None:
         float(v) for v in np.quantile(values, [PROFILE_TAIL_SHARE, 1.0 - PROFILE_TAIL_SHARE])
     )
     edges: Array = np.linspace(low, high, PROFILE_BIN_COUNT + 1)
+    # The values between the quantiles may be equal although the outermost ones are not.
     return edges if edges[-1] > edges[0] else None
 
 

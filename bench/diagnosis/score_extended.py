@@ -84,6 +84,7 @@ def score_model(
     check_value_sizes(scored)
     check_recording_plausible(scored, kind, force)
     check_recording_size(scored, kind(engine=engine), force)
+    # Versions of the recording, of which the one with the smallest error counts.
     versions = [scored]
     if kind.has_model:
         filled, note = fill_lost_commands(scored)
@@ -186,7 +187,8 @@ def _load_robot(
     missing_actuators = {
         name: table for name, table in described_actuators.items() if name not in present_actuators
     }
-    # An MJCF contains its own step and integrator, which may be a result of the diagnosis.
+    # An MJCF contains its own step and integrator, which may be a result of the diagnosis. Only
+    # the names of the floating joints with a recorded pose are taken from the description.
     engine = reference.engine if reference else {}
     if model.suffix != ".urdf":
         engine = {key: engine[key] for key in ("recorded_bases",) if key in engine}

@@ -183,7 +183,11 @@ class Verdict(Document):
 
     @property
     def meaning(self) -> str:
-        """Meaning of the verdict in one sentence."""
+        """Meaning of the verdict in one sentence.
+
+        More special cases come first: a wrong unit or sign of the recording, then a coefficient of
+        a cause that is not a result, then a base parameter at a bound of its range.
+        """
         if self.recording_faults:
             return FAULTY
         if self.cut is None and self.has_open_numbers:

@@ -134,26 +134,30 @@ def build_datasheet(
     Raises:
         InputError: The joint does not exist, or the logs are not of this system.
     """
+    # 1. Joint or system, whose channels must be recorded.
     kind = extended.kind
     assert kind is not None
     subject = make_subject(kind, joint)
+    recorded_channels = list(recording.runs[0].channels)
     for channel in extended.observe:
-        recorded_channels = list(recording.runs[0].channels)
         if channel not in recorded_channels:
             raise make_unknown_name_error(
                 f"channel of {recording.path}", channel, recorded_channels
             )
-    # Prepare the recording as for a diagnosis.
+    # 2. Recording, prepared as for a diagnosis; its own constants take precedence.
     recording = replace(recording, constants={**extended.constants, **recording.constants})
     recording, _ = leave_out_settling(recording, kind)
     recording, _ = segment_recording(recording, kind)
+    # 3. Absent effects.
     is_driven = subject.is_driven(recording)
     absent_effects = []
     for absent_name in list_absent_effects(subject, extended):
         effect = library.find_effect(absent_name, kind.system)
         if (is_driven or not _needs_drive(absent_name, effect)) and not _is_stop(effect):
             absent_effects.append(absent_name)
+    # 4. Detection limits and rows.
     candidates = [*extended.effects, *absent_effects]
+    # A simulator with its own integrator has no engine to choose.
     engine = None if kind.own_engine else extended.engine
     evaluator = RunEvaluator(kind, recording, recording.training(), engine, candidates=candidates)
     with closing(evaluator):
@@ -190,6 +194,8 @@ def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> I
     ]
     modelled = {*local_effects, *extended.effects}
     effect_classes = {effect.name: effect for effect in subject.list_effects()}
+    # An effect names in `contains` the simpler ones to which it reduces if some of its coefficients
+    # are zero.
     simpler_effects = {
         contained_effect
         for name in local_effects

@@ -136,6 +136,7 @@ class _Rows:
             name: fitted_value.value for name, fitted_value in self.extended.parameters.items()
         }
         values_by_name = {**self.extended.constants, **parameters}
+        # Fitted parameters of the system; further fitted numbers are coefficients of effects.
         indices, free = [], []
         for index, name in enumerate(self.detection_limits.free):
             if name in parameters:
@@ -220,7 +221,8 @@ class _Rows:
                 if _may_be_zero(fitted_value):
                     yield self._make_hidden_row(row, effect, fitted_value)
                     continue
-                # Name of the coefficient among the fitted parameters.
+                # Name of the coefficient among the fitted parameters: `EFFECT.COEFFICIENT` for one
+                # of several, followed by `@PLACE` in a family.
                 parameter = name
                 if len(coefficients) > 1:
                     parameter += f".{coefficient}"

@@ -191,16 +191,14 @@ def _compute_prediction_half_widths(
         consistencies: Consistency of each parameter between runs, and between logs if there are
             several.
     """
-    by_run = {
-        consistency.number: Z95 * consistency.prediction_sigma
-        for consistency in consistencies
-        if consistency.by == "run"
-    }
-    return by_run | {
-        consistency.number: Z95 * consistency.prediction_sigma
-        for consistency in consistencies
-        if consistency.by == "log"
-    }
+    half_widths_by_grouping: dict[str, dict[str, float]] = {"run": {}, "log": {}}
+    for consistency in consistencies:
+        # Groups by a constant, such as a load, are not used.
+        if consistency.by in half_widths_by_grouping:
+            half_width = Z95 * consistency.prediction_sigma
+            half_widths_by_grouping[consistency.by][consistency.number] = half_width
+    # A new log is more general than a new run, so that it takes precedence.
+    return {**half_widths_by_grouping["run"], **half_widths_by_grouping["log"]}
 
 
 def _add_small_gaps(
@@ -330,14 +328,16 @@ class _DetectionLimitCalculator:
         self.products, _ = compute_schur_complement(
             parameter_block, fisher_blocks.cross, fisher_blocks.states
         )
+        # The columns are the q parameters, then the K candidates, and the residual as the last one.
         inner = slice(0, self.q)
         self.covariance = invert_scaled(parameter_block[inner, inner], self.products[inner, inner])
-        cross_products = self.products[self.q : -1, : self.q]
+        cross_products = self.products[self.q : -1, : self.q]  # d'A
         self.projections = projections = cross_products @ self.covariance
-        raw_powers = np.diagonal(self.products)[self.q : -1]
+        raw_powers = np.diagonal(self.products)[self.q : -1]  # d'd
         self.powers = np.maximum(
             raw_powers - np.einsum("kq,kq->k", projections, cross_products), 0.0
         )  # (1)
+        # d'e - d'A (A'A)^-1 A'e
         gradients = self.products[self.q : -1, -1] - projections @ self.products[: self.q, -1]
         self.newton_steps = gradients / np.maximum(self.powers, 1e-300)  # (2)
 
@@ -506,6 +506,7 @@ class _DetectionLimitCalculator:
         # Information on a candidate before the parameters absorb a part of it.
         (_, smallest), (_, largest) = sizes_and_candidates[0], sizes_and_candidates[-1]
         information = np.diagonal(self.products)[self.q : -1]
+        # A limit acts more the smaller it is.
         if information[smallest] > information[largest]:
             return DetectionLimit(max(detectable_sizes, default=np.inf), limit="below")
         return DetectionLimit(min(detectable_sizes, default=np.inf), limit="above")

@@ -138,8 +138,11 @@ def compute_drive_diagram(
     def backward_balance(u: Array, p: Array) -> Array:
         return u - p + joint.pull(u, p) + joint.friction(u, p)  # (2)
 
-    # Increases with the load, and is zero where the load starts to drive the motor.
     def unpowered_balance(p: Array) -> Array:
+        """Return a balance that is zero where a load p starts to drive the unpowered motor.
+
+        The sign is reversed, so that it increases with the load, as the bisection requires.
+        """
         return -backward_balance(np.zeros_like(p), p)
 
     return DriveDiagram(
@@ -167,6 +170,7 @@ def _find_roots(function: Callable[[Array], Array], search_range: float, count: 
         count: number N of functions.
     """
     low, high = np.full(count, -search_range), np.full(count, search_range)
+    # Tested before the bisection, which moves both ends.
     is_never_positive, is_always_positive = function(high) <= 0, function(low) > 0
     for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)

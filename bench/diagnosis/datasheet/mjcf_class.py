@@ -96,6 +96,7 @@ def describe_log_for_model(
     import tomli_w
 
     path = sheet.recording.path
+    # Runs name their log only if there are several logs.
     if path.suffix != ".csv" or any(run.log for run in sheet.recording.runs):
         return
     log_description = read_toml(get_description_path(path))
@@ -408,6 +409,7 @@ def _map_effects_to_model(
             continue
         # An effect on the environment has no place.
         place = place_by_kind.get(effect.at, "")
+        # A coefficient that is not in the file is zero.
         zero_value = FittedValue(0.0, "1", None, None)
         coefficients = {
             coefficient.name: numbers.get(coefficient.name, zero_value)

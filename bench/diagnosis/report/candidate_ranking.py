@@ -55,6 +55,7 @@ def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
     if not has_placed_causes(report):
         return [RankedCandidate(candidate) for candidate in ordered_candidates]
     causes = {cause.effect for cause in report.verdict.causes}
+    # Candidates by the name of their effect without its place.
     candidates_by_effect: dict[str, list[Candidate]] = {}
     for candidate in ordered_candidates:
         base, _ = split_effect_name(candidate.effect)
@@ -64,6 +65,7 @@ def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
         diagnosed = [candidate for candidate in group if candidate.effect in causes]
         first, *others = diagnosed or [_choose_representative(group)]
         elsewhere = tuple(c for c in group if c not in (first, *others))
+        # The first cause has the other places; further causes have entries without any.
         entries += [RankedCandidate(first, elsewhere), *map(RankedCandidate, others)]
     return sorted(entries, key=lambda entry: entry.best.score, reverse=True)
 

@@ -94,6 +94,7 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     """
     candidates = select_shown_candidates(report)
     names = [_format_candidate_name(report, candidate) for candidate in candidates]
+    # The left panel needs the share of enough candidates, and any candidate.
     simulated_count = sum(candidate.heldout_gain is not None for candidate in candidates)
     has_shares = simulated_count >= MIN_SIMULATED_SHARE * len(candidates) > 0
 

@@ -124,6 +124,7 @@ def format_missing_causes(causes: Sequence[Cause], with_alternatives: bool = Tru
     """
     if not with_alternatives:
         causes = [replace(cause, alternatives=()) for cause in causes]
+    # Parts of the sentence by their verb.
     lacks, has, either = [], [], []
     # Causes without alternatives share one list; each other cause has its own "or" list.
     certain = [cause.effect for cause in causes if not cause.alternatives]
@@ -143,7 +144,11 @@ def format_missing_causes(causes: Sequence[Cause], with_alternatives: bool = Tru
             has.append(wrong)
         else:
             lacks.append(missing)
-    parts = [f"{verb} {', and '.join(t)}" for verb, t in (("lacks", lacks), ("has", has)) if t]
+    parts = [
+        f"{verb} {', and '.join(texts)}"
+        for verb, texts in (("lacks", lacks), ("has", has))
+        if texts
+    ]
     return ", and ".join([*parts, *either])
 
 

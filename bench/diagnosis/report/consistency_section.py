@@ -102,9 +102,11 @@ def name_missing_physics(
         is_increasing: Whether the parameter increases with the covariate.
         known_effects: Effects in the model already, which cannot be missing.
     """
+    # Physical law to which the parameter belongs, such as "dry" for dry friction.
     base_name, _, _ = number.partition("@")
     law = next((law for law, prefix in LAW_PREFIXES.items() if base_name.startswith(prefix)), "")
     explanation = MISSING_PHYSICS_NAMES.get((law, kind), "")
+    # Some explanations depend on the direction of the trend.
     if isinstance(explanation, tuple):
         if_increasing, if_decreasing = explanation
         explanation = if_increasing if is_increasing else if_decreasing

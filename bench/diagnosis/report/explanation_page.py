@@ -260,8 +260,8 @@ def render_report(
 ) -> str:
     """Render the report as HTML.
 
-    The template gets the report data, and the modules whose functions format them; tables and
-    charts are drawn by the script of the page.
+    The template (Jinja2) gets the report data, and the modules whose functions format them; tables
+    and charts are drawn by the script of the page.
 
     Args:
         report: Report data.

@@ -176,9 +176,12 @@ def _build_matrices(placed: Sequence[CauseRow], effects: set[str]) -> list[dict[
             # The keys are an ordered set.
             matrix["places"][row.place] = True
             by_place = matrix["effects"].setdefault(row.effect_name, {})
-            by_place[row.place] = min(by_place.get(row.place, row), row, key=lambda row: row.rank)
+            known_row = by_place.get(row.place, row)
+            # Rank 0 is the most certain status.
+            by_place[row.place] = min(known_row, row, key=lambda row: row.rank)
 
     def list_ranks(effect_rows: tuple[str, dict[str, CauseRow]]) -> list[int]:
+        """Return the sort key of an effect: the ranks of its places, the most certain first."""
         _, by_place = effect_rows
         return sorted(row.rank for row in by_place.values())
 

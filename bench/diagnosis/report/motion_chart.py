@@ -362,8 +362,9 @@ def _make_tooltip_lines(unit: str, sigma: float, extended: bool) -> tuple[Toolti
         extended: whether there is an extended model.
     """
 
-    def residual(label: str, y: str, style: MarkStyle) -> TooltipLine:
-        return TooltipLine(label, y, "σ", style, sigma, unit)
+    def residual(label: str, column: str, style: MarkStyle) -> TooltipLine:
+        # A residual in σ times `sigma` has the unit of the channel.
+        return TooltipLine(label, column, "σ", style, sigma, unit)
 
     tooltip_lines = [
         TooltipLine("measured", "measured", unit, MEASURED_STYLE),

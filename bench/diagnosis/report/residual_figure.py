@@ -335,9 +335,13 @@ def select_informative_profiles(profiles: Sequence[ResidualProfile]) -> list[Res
     first_of_variable: list[ResidualProfile] = []
     further: list[ResidualProfile] = []
     known_variables: set[str] = set()
+    # The most significant profile comes first.
     for profile in sorted(measured_profiles, key=_compute_profile_significance, reverse=True):
-        (further if profile.variable in known_variables else first_of_variable).append(profile)
-        known_variables.add(profile.variable)
+        if profile.variable in known_variables:
+            further.append(profile)
+        else:
+            first_of_variable.append(profile)
+            known_variables.add(profile.variable)
     return [*first_of_variable, *further][:MAX_PROFILES]
 
 
