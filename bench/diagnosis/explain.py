@@ -243,7 +243,12 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
 
 
 def _make_simulation_error(base: BaseModel, error_check: RecordingErrorCheck) -> InputError:
-    """Return the error that explains why nothing could be simulated."""
+    """Return the error that explains why nothing could be simulated.
+
+    Args:
+        base: base model whose fit failed.
+        error_check: check for wrong units and signs, which may have found the reason.
+    """
     path = base.runs.recording.path
     if error_check.errors:
         return InputError(f"{path}: {error_check.errors[0].says}")

@@ -36,6 +36,9 @@ def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
 
     The files are loaded again and compared with the intended model; on a mismatch no file is
     returned.
+
+    Args:
+        extended: extended simulator of a diagnosis, with the fitted changes.
     """
     kind: Any = extended.kind
     if kind is None or not kind.has_model:
@@ -177,6 +180,9 @@ def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, Fitted
 
     They are numbers of its model file that the user freed for the fit, diagnosed effects, and the
     time step and other options of the integrator if they differ from those of the file.
+
+    Args:
+        extended: extended simulator of a robot, with the fitted values.
     """
     kind: Any = extended.kind
     causes: dict[str, Mapping[str, FittedValue]] = {}

@@ -203,7 +203,7 @@ class _IdentifiabilityAssessment:
     def _project_out_parameters(self, candidates: Sequence[int], basis: Array) -> Array:
         """Return the part of k responses, in units of the noise, that nothing else can reproduce.
 
-        The parts that a change of the initial states or of the free parameters can reproduce are
+        The parts that a change of the initial states or of the q free parameters can reproduce are
         projected out. The result is (N, k), for N samples times channels of all runs.
 
         Args:
@@ -370,7 +370,11 @@ def _classify_parameter(
 
 
 def format_identifiability(assessments: Sequence[ParameterIdentifiability]) -> list[str]:
-    """Format the free parameters and the best identifiable causes as lines for the terminal."""
+    """Format the free parameters and the best identifiable causes as lines for the terminal.
+
+    Args:
+        assessments: identifiability of each free parameter, then of each cause, best first.
+    """
     lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
     lines += [f"  {_format_parameter(number)}" for number in assessments if number.free]
     causes = {level: [n for n in assessments if not n.free and n.word == level] for level in _WORDS}
@@ -398,6 +402,9 @@ def _format_parameter(number: ParameterIdentifiability) -> str:
     """Format one parameter with its level, interval, range and confounded parameters.
 
     A limit or backlash has no interval (NaN), and a parameter without influence an infinite one.
+
+    Args:
+        number: identifiability of a parameter, or of a coefficient of a cause.
     """
     if np.isfinite(number.half):
         interval_text = f"±{number.half:.2g} {format_unit(number.unit)}".rstrip()

@@ -73,6 +73,9 @@ def format_log_table(rows: Sequence[LogResult]) -> str:
     """Format the table of all logs as CSV, with one row for each number of each cause.
 
     A log without causes has one row, in which the cells of the cause are empty.
+
+    Args:
+        rows: result of each log, with its causes as in verdict.json.
     """
     lines: list[tuple[object, ...]] = []
     for row in rows:
@@ -102,6 +105,9 @@ def list_common_causes(rows: Sequence[LogResult]) -> list[CommonCause]:
     """List the causes over all logs, the most common first.
 
     Alternatives that the data of a log do not distinguish count as one cause.
+
+    Args:
+        rows: result of each log, with its causes as in verdict.json.
     """
     logs_by_cause: dict[str, list[str]] = {}
     numbers_by_cause: dict[str, dict[str, list[Mapping[str, Any]]]] = {}

@@ -85,6 +85,9 @@ def list_option_causes(finding: OptionFinding) -> list[Cause]:
     """Return the options of the solver that differ from the model file as causes.
 
     The coefficient of an option that is a word is its MuJoCo number.
+
+    Args:
+        finding: simulator class of the robot with the other options, and their gain.
     """
     from sims.robot.integrator_settings import OPTION_EFFECTS, format_option, list_changed_options
 

@@ -314,6 +314,9 @@ def describe_ranges(
 
     The text has the value in the model file if there is one, the value with the effect and its
     range, the unit, and the cause.
+
+    Args:
+        ranges: ranges of the numbers of a robot.
     """
     for number_range in ranges.ranges:
         place_text = "the world"

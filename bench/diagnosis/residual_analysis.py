@@ -170,6 +170,8 @@ def compute_speeds(evaluator: RunEvaluator, simulated: Array) -> Array | None:
 def _compute_slopes(evaluator: RunEvaluator, simulated: Array, channel: str) -> Array:
     """Compute the time derivative (R, T) of a simulated channel; NaN after the end of a run.
 
+    Shapes: R runs, T samples, C channels.
+
     Args:
         evaluator: Run evaluator of the runs.
         simulated: (R, T, C) simulated motion.

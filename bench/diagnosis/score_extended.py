@@ -148,6 +148,9 @@ def _compute_errors(
 def _check_plugin(model: Path) -> None:
     """Refuse an extended.toml of a user-defined simulator whose plugin is not loaded.
 
+    Args:
+        model: path of the extended.toml; a robot, or a simulator of simgap, is accepted.
+
     Raises:
         InputError: The plugin is missing; the message names the option, with the plugin given to
             explain if it is stored in the folder.
@@ -278,7 +281,14 @@ def build_theta(evaluator: RunEvaluator, extended: ExtendedSimulator) -> Array:
 
 
 def _summarise_errors(errors: _ScoredRuns) -> dict[str, Any]:
-    """Summarise the RMS error of each channel, and that of all in units of the noise."""
+    """Summarise the RMS error of each channel, and that of all in units of the noise.
+
+    Args:
+        errors: squared errors of the runs, and the noise of each channel.
+
+    Returns:
+        The document of `score_model`: errors, numbers of runs and samples, and units.
+    """
     evaluator, squares, sigma = errors
     observed_mask = np.isfinite(evaluator.observed)
     counts = observed_mask.sum(axis=(0, 1))

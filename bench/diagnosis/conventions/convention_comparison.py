@@ -802,7 +802,11 @@ def _select_liveliest_part(run: Run) -> slice:
     """Return the slice of a run, of `PART_SAMPLES` samples, in which its channels move most.
 
     Hypotheses are compared on such segments, because filtering whole runs would take too long. The
-    starts that are compared are half a segment apart.
+    starts that are compared are half a segment apart. Of a short run, nearly all samples are
+    returned.
+
+    Args:
+        run: recorded run: times, channels and inputs.
     """
     # The hypothesis of late commands moves them to earlier samples, so the last samples of a run
     # would have no command.

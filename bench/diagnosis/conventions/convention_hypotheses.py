@@ -107,6 +107,10 @@ def _advance_inputs(run: Run, delay: float) -> Run:
     The end of the run is cut off, because its new inputs were not recorded. Samples are moved
     instead of the offset of the time stamps, because a part of a run contains no inputs after its
     end. Inputs that are linear between samples are interpolated; others hold their last value.
+
+    Args:
+        run: recorded run; `run.linear` names the inputs that are linear between samples.
+        delay: delay of the command time stamps in s, positive.
     """
     shifted_times = run.times + delay
     # Samples whose new input was recorded, with half a delay of tolerance; a run has at least two.
@@ -281,6 +285,9 @@ def _generate_signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
 
     They are: position with velocity, the commands, velocity alone, torque alone, and the whole axis
     (all signals of the joint).
+
+    Args:
+        joint: joint with the names of its channels by quantity, and of its inputs.
     """
     positions = [joint.channels[q] for q in ("q", "qd") if q in joint.channels]
     groups = [positions, list(joint.inputs)]

@@ -560,7 +560,7 @@ def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[s
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        shares: (C,) RMS residual of each channel, as a share of its standard deviation.
+        shares: (C,) RMS residual of each of C channels, as a share of its standard deviation.
     """
     if not evaluator.kind.has_model:
         return None
@@ -723,7 +723,7 @@ def _build_rescaled_evaluator(
 
     Returns:
         The run evaluator, which the caller closes, and the noise with the standard deviation sigma
-        (C,) of each channel and no autocorrelation.
+        (C,) of each of C channels and no autocorrelation.
     """
     evaluator = subject.evaluator(subject.rescale(factors))
     # The noise is scaled with its channel.

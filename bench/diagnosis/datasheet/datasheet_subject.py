@@ -164,9 +164,12 @@ class SheetSubject:
     def _get_file_value(self, base: str, effect_place: Any) -> ModelFileValue:
         """Return the model file's value of the number that an effect changes here.
 
-        `base` is the name of the effect without its place, and `effect_place` the joint or
-        actuator, whose `stated` has the values by effect. A number that an effect changes by a
-        share of its value has its own unit; others have the unit of the effect's coefficient.
+        A number that an effect changes by a share of its value has its own unit; others have the
+        unit of the effect's coefficient.
+
+        Args:
+            base: name of the effect without its place.
+            effect_place: the joint or actuator; its `stated` has the values of the file by effect.
         """
         length, force = ("m", "N") if effect_place.kind == "slide" else ("rad", "N*m")
         is_relative = base in RELATIVE_VALUE_UNITS

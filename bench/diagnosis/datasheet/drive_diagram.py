@@ -192,6 +192,10 @@ class _Joint:
         `laws` has each law with its K coefficients (K, 1, 1). `without` names the laws with a
         hidden state, which have no fixed force at rest; the diagram omits them. `stated` is the
         Coulomb friction in the model file, in N or N·m; 0 if there is none.
+
+        Args:
+            subject: joint or system of the data sheet.
+            extended: extended simulator with the fitted effects.
         """
         self.system = _Slide() if subject.is_prismatic else _StaticJoint()
         self.laws: list[tuple[Effect, Array]] = []
@@ -217,7 +221,11 @@ class _Joint:
     def friction(self, drive: Array, load: Array) -> Array:
         """Compute the largest force (N,) that the friction of the joint can hold at rest.
 
-        It is the sum over all friction laws, under N pairs of drive and load force.
+        It is the sum over all friction laws.
+
+        Args:
+            drive: (N,) forces of the drive, in N or N·m.
+            load: (N,) loads that it works against.
         """
         moment = self._make_rest_state(drive, load)
         limits = [np.full(len(drive), self.stated)]
@@ -245,9 +253,14 @@ class _Joint:
         return pull
 
     def _make_rest_state(self, drive: Array, load: Array) -> StateSnapshot:
-        """Build the state of the joint at rest, under N pairs of drive and load force (N,).
+        """Build the state of the joint at rest, under N pairs of drive force and load.
 
-        Friction and force laws are evaluated at this state.
+        Friction and force laws are evaluated at this state, a batch of N elements with position,
+        velocity and time zero.
+
+        Args:
+            drive: (N,) forces of the drive, in N or N·m.
+            load: (N,) loads that it works against.
         """
         zeros = np.zeros((len(drive), 1))
         inputs = {"drive": drive[:, None], "load": load[:, None]}

@@ -51,6 +51,9 @@ def group_runs_by_constants(sheet: SheetContent) -> list[ConstantsGroup]:
 
     An MJCF model has fixed numbers, so each group needs its own model.
 
+    Args:
+        sheet: content of the data sheet, with the recording and the extended simulator.
+
     Returns:
         A group for each set of constants, with all numbers of its model by name. The later source
         of a number takes precedence: defaults of the system, constants of the recording, constants
@@ -96,7 +99,7 @@ def describe_log_for_model(
     import tomli_w
 
     path = sheet.recording.path
-    # Runs name their log only if there are several logs.
+    # Runs name their log only if several logs were joined.
     if path.suffix != ".csv" or any(run.log for run in sheet.recording.runs):
         return
     log_description = read_toml(get_description_path(path))
@@ -157,7 +160,7 @@ def _compute_friction_limits(
     effect: type[Friction],
     numbers: Mapping[str, FittedValue],
 ) -> Array:
-    """Compute the limit (T,) of a friction law at each sample of a run, as one batch.
+    """Compute the limit (T,) of a friction law at each of T samples of a run, as one batch.
 
     The limit is the largest dry friction at that position, velocity and input; its mean replaces a
     law that MuJoCo lacks.

@@ -519,6 +519,9 @@ class RunEvaluator:
 
         It shares the parameters, the search control and the worker pool, and the durations and
         ranges from which the values of shape parameters, such as frequencies, are chosen.
+
+        Args:
+            runs: the other runs, such as segments of these.
         """
         evaluator = self._copy(self.kind, runs)
         # Periodic effects continue from segment to segment, and a value found in one segment holds
@@ -661,8 +664,11 @@ class RunEvaluator:
         Elements are in one call only if they need the same time steps (`group_compatible`).
 
         Args:
-            theta: (L, P) parameters of the batch elements.
+            theta: (L, P) parameters of L batch elements.
             max_batch_size: maximum number of elements of a call.
+
+        Yields:
+            Whether the call needs fine steps, and the indices of its elements.
         """
         groups = self.group_compatible(theta)
         for group in np.unique(groups):

@@ -523,6 +523,10 @@ def _compute_largest_factor(signal: Array, limits: Interval) -> float:
 
     It is infinite if nothing limits the signal. It has three decimals, as such a factor is easy to
     set.
+
+    Args:
+        signal: (T,) samples of an input.
+        limits: lower and upper limit, in the unit of the signal; infinite for no limit.
     """
     extremes = float(signal.min()), float(signal.max())
     # The smallest value is compared with the lower limit, the largest one with the upper limit. No

@@ -191,7 +191,7 @@ def _compute_discrimination(
         run: run that could be recorded.
         model: fitted model with one of the causes.
         competing_model: fitted model with the other one.
-        sigma: (C,) standard deviation of the noise of each channel.
+        sigma: (C,) standard deviation of the noise of each of C channels.
     """
     thetas = np.stack([model.fit.theta, competing_model.fit.theta])
     predictions = evaluator.simulate_scenarios(

@@ -172,6 +172,9 @@ class RunRanker:
         the models still differ on the run after the competing one has adapted to it. Otherwise it
         is the information gain D: by how much the run narrows the uncertain parameters. Runs that
         cannot be simulated, or are too sensitive to the initial state, are left out.
+
+        Args:
+            runs: candidate runs, with their scenario and initial state.
         """
         diagnosed_model = self.information[0].model
         allowed_runs = [
@@ -247,6 +250,9 @@ class RunRanker:
         slow. The size of a run is the sum over the pairs of models of log(1 + |d|^2), with the
         whitened difference d of their predictions; the logarithm prevents that one pair dominates.
         With a single model, d is its motion about the mean.
+
+        Args:
+            runs: candidate runs within the limits of the robot.
         """
         thetas = [information.model.fit.theta for information in self.information]
         sizes = []
@@ -281,7 +287,10 @@ class RunRanker:
     def _whiten(self, values: Array) -> Array:
         """Whiten L predictions of a run (L, T, C), or differences of them, to vectors (L, T C).
 
-        `whiten` expects one run with L columns, (1, T, C, L), and the mask (1, T, C).
+        Whitening gives independent noise of variance one. `whiten` expects one run with L columns,
+        (1, T, C, L), and the mask (1, T, C).
+
+        Shapes: T samples, C channels.
         """
         is_observed = np.ones((1, *values.shape[1:]), dtype=np.bool_)
         columns = np.moveaxis(values, 0, -1)[None]

@@ -56,6 +56,10 @@ class RigLimits:
 
         `present_runs` has the simulated channels of each present run, (T,) by name, and `bounds`
         the lowest and highest value that a proposed run may have, by channel.
+
+        Args:
+            evaluator: run evaluator of the present runs.
+            model: model fitted to them.
         """
         self.evaluator = evaluator
         fitted_states = model.fit.initial_states

@@ -163,6 +163,9 @@ class ModelSet:
         It is M = 2 log L - k log n - sum_e max(c_e - k_e log n, 0), with the likelihood L, k fitted
         parameters and determined initial states, n samples, and for each effect e its k_e
         coefficients and the gain c_e of its best shape from noise alone.
+
+        Args:
+            fit: fit of a model; its cost is infinite if the model could not be simulated.
         """
         # k of (1): fitted parameters, and initial states that the data determine.
         freedom = fit.free_indices.size + count_identified_states(self.evaluator, fit, self.noise)
@@ -312,6 +315,10 @@ class ModelSet:
 
         This is needed if the fit ended with derivatives from a nearby point, for example for
         confidence intervals. A fit with zero iterations computes them.
+
+        Args:
+            model: fitted model; the result with its own derivatives is stored if the model is
+                stored.
         """
         # A model that could not be simulated has no derivatives.
         if model.fit.is_own_jacobian or not np.isfinite(model.fit.cost):
@@ -344,6 +351,12 @@ class ModelSet:
         3. Reject a fit with clearly larger residuals: with structured residuals, this method
            prefers smooth residuals to small ones.
         4. Stop if the penalised log-likelihood hardly increases.
+
+        Args:
+            model: fitted model, from which the first of these fits starts.
+
+        Returns:
+            The best of these fits, or the given model if none is better.
         """
         self.evaluator.search_control.begin_stage("refining the model")
         # Costs of fits with different noise weights are compared by those of the present noise.

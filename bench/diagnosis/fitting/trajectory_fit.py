@@ -427,6 +427,8 @@ class TrajectoryFitter:
         sticks in the same place from wherever it began. No fit would find back from there. Each run
         is compared on its own.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             fit_state: state of the fit, whose point is changed in place.
             sample_mask: (R, T, C) samples that count in the cost.
@@ -699,6 +701,11 @@ class TrajectoryFitter:
     def _sum_run_costs(self, squares: Array, states: Array) -> Array:
         """Return the part of each run (R,) in the cost, from its squared residuals.
 
+        It is the sum over the channels, and the squared deviations of the initial states from their
+        guesses, in prior standard deviations.
+
+        Shapes: R runs, C channels, s states of a run.
+
         Args:
             squares: (R, C) squared whitened residual of each channel of each run.
             states: (R, s) initial states.
@@ -714,6 +721,8 @@ class TrajectoryFitter:
         """Return the squared whitened residual (R, C) of each channel of each run.
 
         It is NaN or infinite where a simulation was abandoned.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             simulated: (R, T, C) simulated runs.
@@ -807,6 +816,8 @@ class TrajectoryFitter:
         is lower. If the trial was simulated without derivatives, Broyden's method updates those of
         the last point.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             fit_state: state of the fit, changed in place.
             point: the simulated trial point.
@@ -839,6 +850,8 @@ class TrajectoryFitter:
         self, fit_state: FitState, trial: FitPoint, sample_mask: Mask
     ) -> tuple[FitPoint, bool]:
         """Take a step of initial states in the runs that it improves, and update their damping.
+
+        Shapes: R runs, T samples, C channels.
 
         Args:
             fit_state: state of a fit of initial states alone, changed in place.
@@ -892,7 +905,7 @@ def _combine_runs(last: FitPoint, trial: FitPoint, is_moved: Mask, costs: Array)
     Args:
         last: the point before the step.
         trial: the point after the step.
-        is_moved: (R,) mask of the runs of the trial point.
+        is_moved: (R,) mask of those of the R runs that have the trial point.
         costs: (R,) costs of the combined runs.
     """
     states = np.where(is_moved[:, None], trial.start.initial_states, last.start.initial_states)

@@ -175,6 +175,10 @@ def _search_and_decide(search: EffectSearch, runs: SimulatedRuns) -> DiagnosisRe
 
     For a robot whose runs could be filtered, the search uses prediction errors. Otherwise it is a
     search by simulation; for a robot in contact, effects at the contacts are tried first.
+
+    Args:
+        search: search that has not begun, with the fitted base model.
+        runs: the runs, with their filters and their validation.
     """
     if runs.fitting.filtered_runs is None:
         if runs.fitting.is_in_contact:

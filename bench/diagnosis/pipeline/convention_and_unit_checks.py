@@ -76,6 +76,9 @@ def refuse_broken_conventions(runs: SimulatedRuns) -> None:
     Conventions are signs, zeros, units and frames of the signals. The test compares forces of the
     linear model, so it is left out where contacts make these wrong, and with ``--force``.
 
+    Args:
+        runs: the prepared runs; those of a system that is not a robot are not tested.
+
     Raises:
         InputError: The conventions differ; the message names the change to make.
     """

@@ -121,6 +121,8 @@ class HeldOutGains:
     ) -> HeldOutGain:
         """Compute the gain of a prediction over that of the base model.
 
+        Shapes: R runs, T samples, C channels.
+
         Args:
             runs: the predicted runs.
             before: (R, T, C) prediction of the base model.

@@ -18,6 +18,12 @@ def leave_out_unpredictable_segments(runs: SimulatedRuns) -> SimulatedRuns:
 
     Runs for fitting and held-out runs are treated separately. If the filter follows less than half
     of them, the model may be wrong instead, and all of them are kept.
+
+    Args:
+        runs: segments of a robot on the ground.
+
+    Returns:
+        The remaining segments; `runs` itself if none is left out.
     """
     # This import is needed for robots only.
     from bench.diagnosis.kalman.linearised_filter import FollowedRuns

@@ -113,6 +113,10 @@ def _add_contact_effects(
 
     Only pairs of geoms that touch in the recorded motion get effects such as contact friction.
     Without any, and for a system, the simulator is returned as it is.
+
+    Args:
+        recording: the recording, whose motion shows the contacts.
+        kind: class of the simulator.
     """
     if not kind.has_model:
         return kind
@@ -155,6 +159,9 @@ def _fill_lost_commands(runs: SimulatedRuns) -> SimulatedRuns:
     A logger may have lost a row whose command was sent, or the controller may have sent none, so
     that the previous command was held. A filter is run with both; the more likely one shows which.
     Held commands must be clearly likelier, by a log-likelihood for each filled row.
+
+    Args:
+        runs: the runs as recorded, in which the command before a lost row is held.
 
     Returns:
         The given runs if no row is lost or the commands were held; otherwise the filled runs.

@@ -138,6 +138,10 @@ def _estimate_parameters_by_group(
     needs another coefficient in each group. The competitor is the likeliest single effect with one
     coefficient that is not part of the diagnosis. The result is empty without a competitor, or if
     there is not exactly one cause.
+
+    Args:
+        search: the search, with its fitted models by their effects.
+        finding: its outcome, with the causes.
     """
     if len(finding.causes) != 1:
         return ()
@@ -168,8 +172,11 @@ def _assess_identifiability(search: EffectSearch) -> tuple[ParameterIdentifiabil
     """Assess identifiability from the responses of the runs to effects (directions).
 
     The search has computed them about the base model, on their own or together with scores. If it
-    has not, the result is empty. It is the last that is asked of the search, so its memory is
+    has not, the result is empty. This is the last step that uses the search, so its memory is
     released first.
+
+    Args:
+        search: the finished search.
     """
     search.release_memory()
     directions = search.get_known_directions()
@@ -193,7 +200,7 @@ def _summarise_held_out(
 
     Args:
         result: result of the search.
-        sigma: (C,) standard deviation of the noise of each channel.
+        sigma: (C,) standard deviation of the noise of each of C channels.
     """
     evaluator, held_out_fits = result.runs.predicted, result.finding.held_out_fits
     names = result.finding.model.effects
@@ -215,7 +222,9 @@ def _summarise_held_out(
 def _list_channels(runs: SimulatedRuns, sigma: Array) -> tuple[ChannelInfo, ...]:
     """Return name, unit and noise of each channel.
 
-    `sigma` (C,) is the noise standard deviation of each channel in its unit.
+    Args:
+        runs: the runs, with their channels and their noise floor.
+        sigma: (C,) standard deviation of the noise of each of C channels, in its unit.
     """
     noise_floor = runs.floor
     rows = zip(
@@ -236,6 +245,9 @@ def _list_parameter_changes(result: SearchResult) -> Iterator[ParameterChange]:
 
     A parameter is marked if the data do not determine it, so that it was kept at its nominal
     value.
+
+    Args:
+        result: result of the search, with the fits of the base model and of the found model.
     """
     evaluator = result.runs.fitting
     before = result.estimate(result.finding.base).values
@@ -259,6 +271,9 @@ def _list_unexplained(result: SearchResult) -> Iterator[str]:
 
     These are channels above the noise, the dependence of an unmodelled force, and parameters that
     the data do not identify.
+
+    Args:
+        result: result of the search, with the lack-of-fit test of the extended model.
     """
     evaluator, lack_of_fit = result.runs.fitting, result.finding.lack_of_fit
     for channel in lack_of_fit.channels_above_noise:
@@ -283,6 +298,9 @@ def _warn_of_bounds(changes: Sequence[ParameterChange]) -> Iterator[str]:
     The value may then be wrong, and a cause may compensate for it. There are two fits, that of the
     base model and that of the model with the causes. Of a parameter that is at a bound in both,
     only the base fit is reported.
+
+    Args:
+        changes: value, interval and bound of each parameter in both fits.
     """
     for parameter in changes:
         (value_before, *_), (value_after, *_) = parameter.before, parameter.after
@@ -306,6 +324,9 @@ def _list_verdict_reasons(finding: DiagnosisResult) -> Iterator[str]:
     """Yield the reasons for the verdict as sentences, the most important first.
 
     A search that was stopped early has no such reasons.
+
+    Args:
+        finding: outcome of the search: verdict, causes and lack of fit.
     """
     if finding.early_stop is not None:
         return

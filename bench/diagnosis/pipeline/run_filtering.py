@@ -21,6 +21,9 @@ def filter_simulated_runs(runs: SimulatedRuns) -> None:
        a nonlinear filter then estimates the initial states.
     2. Filter them again with fitted base parameters, unless a tuner fits these.
     3. Filter the held-out runs.
+
+    Args:
+        runs: the runs of a robot; their run evaluators receive the filters.
     """
     # This import is needed for robots only.
     from bench.diagnosis.kalman.linearised_filter import FollowedRuns
@@ -59,6 +62,9 @@ def _filter_with_fitted_parameters(runs: SimulatedRuns) -> FollowedRuns:
 
     The fitted parameters are stored in context and evaluator, unless the fit keeps the nominal
     ones.
+
+    Args:
+        runs: the runs of a robot with free numbers of its model file.
     """
     # These imports are needed for robots only.
     from bench.diagnosis.prediction_error.base_identification import identify_base

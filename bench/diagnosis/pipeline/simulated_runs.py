@@ -51,7 +51,14 @@ class DiagnosisContext:
     """
 
     def __init__(self, options: ExplainOptions, worker_pool: ForkedWorkerPool) -> None:
-        """Start the clock of the time limit, without notes and results."""
+        """Start the clock of the time limit, without notes and results.
+
+        The docstring of the class describes the attributes.
+
+        Args:
+            options: options of the explanation.
+            worker_pool: worker pool for simulations and fits.
+        """
         self.started = time.perf_counter()
         self.options = options
         self.say = options.say

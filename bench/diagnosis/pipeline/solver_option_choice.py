@@ -51,7 +51,11 @@ class RatedOptions(NamedTuple):
 
     @classmethod
     def rate(cls, model: BaseModel) -> RatedOptions:
-        """Rate how well a base model explains the fitted runs and predicts the held-out ones."""
+        """Rate how well a base model explains the fitted runs and predicts the held-out ones.
+
+        Args:
+            model: fitted base model, whose runs have the options to rate.
+        """
         search = model.runs.create_search(model.fit)
         rated = search.base_model
         # Without validation, held-out runs count as equally likely.
@@ -73,6 +77,9 @@ class RatedOptions(NamedTuple):
 
         They must close half of the gap, and predict the held-out runs better. If the same options
         are changed, only to other values, a clearly higher likelihood is enough.
+
+        Args:
+            other: base model with other options, to compare with.
         """
         # This import is needed for robots only.
         from sims.robot.integrator_settings import list_changed_options

@@ -26,6 +26,9 @@ def build_verdict(result: SearchResult) -> Verdict:
 
     It has the causes with coefficients, the base parameters, the held-out gain, all candidates with
     their scores, and the proposed next experiment.
+
+    Args:
+        result: result of the search, with the runs, the fitted models and the finding.
     """
     runs, evaluator, finding = result.runs, result.runs.fitting, result.finding
     numbers = result.estimates.values
@@ -91,6 +94,9 @@ def _is_refuted(result: SearchResult) -> bool:
     * the diagnosis has causes, or the search ended early;
     * the residual has structure, or held-out runs show a large discrepancy;
     * no model with effects was fitted.
+
+    Args:
+        result: result of the search; its models are fits by effects.
     """
     search, finding = result.search, result.finding
     if finding.causes or finding.lack_of_fit.has_structure or finding.early_stop is not None:

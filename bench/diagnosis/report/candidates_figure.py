@@ -91,6 +91,9 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     The left panel shows the share of the held-out gap that each closes alone, with its 95 %
     interval, if at least half of the candidates were simulated on held-out runs. The right panel
     shows the score on the fitted runs; without a left panel, the shares are written next to it.
+
+    Args:
+        report: content of the report, with the candidates of the verdict.
     """
     candidates = select_shown_candidates(report)
     names = [_format_candidate_name(report, candidate) for candidate in candidates]

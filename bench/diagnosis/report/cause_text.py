@@ -179,6 +179,9 @@ def format_number_error(cause: Cause) -> str:
     2. A numerical setting such as the time step: what is wrong, and the correction.
     3. A value at a place, by its effect: for example ``the mass of body forearm is 12 % larger
        than the model file states``.
+
+    Args:
+        cause: cause of the verdict, with its description and its fitted coefficients.
     """
     base, place = split_effect_name(cause.effect)
     if cause.says == GRAVITY_COMPENSATED:

@@ -59,8 +59,8 @@ def _select_worst_of_each_kind(
 def compute_detectable_gap(report: DiagnosisReportData) -> Array:
     """Compute the largest gap (C,) that the noise of a channel could hide at 95 %.
 
-    The gap is an RMS in the unit of the channel. r are the n residuals in units of the noise, and s
-    = mean(r^2), which is 1 without a gap:
+    The gap of each of C channels is an RMS in the unit of the channel. r are the n residuals in
+    units of the noise, and s = mean(r^2), which is 1 without a gap:
 
             phi = mean(r_t r_t+1) / s                                   (1)
             n'  = n (1 - phi^2) / (1 + phi^2)                           (2)

@@ -203,6 +203,9 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
     A profile is the mean residual of a channel as a function of another variable, such as a
     velocity. The panels read their curves from the table of `build_residual_profile_table`, by
     channel, variable and model.
+
+    Args:
+        report: content of the report, with the profiles.
     """
     units = {channel.name: channel.unit for channel in report.channels}
     styles = {

@@ -80,6 +80,9 @@ class CauseRow(NamedTuple):
 def build_identifiability_section(report: DiagnosisReportData) -> dict[str, Any] | None:
     """Build the content of the section; None if identifiability was not computed.
 
+    Args:
+        report: content of the report, with the identifiability of each parameter and cause.
+
     Returns:
         Content by the name that the template uses:
 

@@ -71,9 +71,12 @@ class MotionTable(NamedTuple):
 def build_motion_table(report: DiagnosisReportData) -> MotionTable:
     """Build the table of samples that the interactive chart shows.
 
-    About `MAX_ROWS` rows are divided among the runs and channels. If there are too many runs, the
-    best ones are left out; if runs have too many samples, only the extremes of short parts are
-    shown.
+    About `MAX_ROWS` rows are divided among the runs and channels. If there are too many runs, those
+    with the smallest residuals are left out; if runs have too many samples, only the extremes of
+    short parts are shown.
+
+    Args:
+        report: content of the report, with the measured and simulated runs.
     """
     runs = rank_runs(report)
     channel_count = len(report.channels)

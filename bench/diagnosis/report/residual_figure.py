@@ -330,6 +330,9 @@ def select_informative_profiles(profiles: Sequence[ResidualProfile]) -> list[Res
 
     At most `MAX_PROFILES` are selected. The best profile of each variable precedes further profiles
     of the same variable.
+
+    Args:
+        profiles: mean residual of a channel in bins of a variable, such as the speed.
     """
     measured_profiles = [p for p in profiles if np.isfinite(_compute_profile_significance(p))]
     first_of_variable: list[ResidualProfile] = []

@@ -69,6 +69,9 @@ def rank_runs(report: DiagnosisReportData) -> list[RunView]:
     """List all runs by descending gap, but the worst held-out run first, if there is any.
 
     The gap of a run is the RMS residual of the base model in units of the noise; 0 without samples.
+
+    Args:
+        report: content of the report, with the fitted and the held-out runs as data splits.
     """
     sigma = np.array([c.sigma for c in report.channels])
     runs = []

@@ -185,6 +185,9 @@ def list_unidentified_parameters(report: DiagnosisReportData) -> list[str]:
     3. those to which the data are not sensitive,
     4. all parameters,
     5. a phrase for all of them.
+
+    Args:
+        report: content of the report; its parameters have a value and an interval each.
     """
     without_interval = [
         p.name for p in report.parameters if p.is_sensitive and not np.isfinite(p.before).all()

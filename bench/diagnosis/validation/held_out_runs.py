@@ -262,6 +262,10 @@ class HeldOutRuns(Validation):
         from that of the fit as the linearisation says. A chaotic motion leaves its range even if
         the guess is off by no more than the noise. The result is False for a system, whose
         derivatives are differences, and for a failed fit.
+
+        Args:
+            fit: fit of the initial states, whose Jacobian (R, T, C, s) has the derivatives of R
+                runs with T samples of C channels by s initial states.
         """
         evaluator = self.evaluator
         if not evaluator.has_linearisation or not np.isfinite(fit.cost):

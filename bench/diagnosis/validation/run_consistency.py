@@ -426,6 +426,9 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
 
     Each grouping has the labels of its groups, the indices of the runs in each, and, where they
     have an order, the values by which a trend can be tested. A grouping has at least two groups.
+
+    Args:
+        runs: the runs; each names its log and its constants, such as a load.
     """
     # Logs, in their order.
     logs = tuple(dict.fromkeys(run.log for run in runs))
