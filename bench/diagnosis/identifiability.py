@@ -252,14 +252,57 @@ class _IdentifiabilityAssessment:
     def _assess_causes(self) -> list[ParameterIdentifiability]:
         """Assess the coefficient of each possible cause, fitted with the free parameters.
 
+        1. Select the most sensitive direction of each coefficient: the change of all samples by it.
+        2. Compute the interval of the coefficient from the norm of its direction, and its
+           correlations with the coefficients of other effects.
+        """
+        evaluator = self.evaluator
+        # 1. Directions.
+        most_sensitive = self._select_most_sensitive_directions()
+        # 2. Intervals and correlations.
+        selected = list(most_sensitive.values())
+        unit_columns = np.array([direction.unit_column for direction in selected])
+        correlations = np.abs(unit_columns @ unit_columns.T)
+        assessments = []
+        for row, ((name, coefficient_index), direction) in zip(
+            correlations, most_sensitive.items(), strict=True
+        ):
+            parameter_index = evaluator.get_coefficient_indices(name)[coefficient_index]
+            parameter = evaluator.parameters[parameter_index]
+            probe, norm = direction.probe, direction.norm
+            # The standard error of a coefficient is 1 / norm.
+            half_width = Z95 / norm if norm > 0 else np.inf
+            confounders = [
+                (other_effect, float(correlation))
+                for (other_effect, _), other, correlation in zip(
+                    most_sensitive, selected, row, strict=True
+                )
+                if other_effect != name and other.norm > 0
+            ]
+            label = name
+            # An effect with several coefficients is named together with the coefficient.
+            if sum(effect == name for effect, _ in most_sensitive) > 1:
+                label += f" {parameter.name.rpartition('.')[2]}"
+            identifiability = _classify_parameter(label, False, parameter, half_width, confounders)
+            if probe.is_single_size:
+                # The effect of a limit or backlash is not proportional to it; it shows if it is
+                # reached.
+                identifiability = replace(
+                    identifiability, half=np.nan, word=_rate_switching_effect(norm)
+                )
+            assessments.append(identifiability)
+        return assessments
+
+    def _select_most_sensitive_directions(self) -> dict[tuple[str, int], _Direction]:
+        """Return the most sensitive direction of each coefficient, by effect and its index.
+
         A direction is the change of all samples by a coefficient. A coefficient may have several:
         one for each shape, a choice of the other coefficients such as a frequency. A limit or
         backlash (a switching effect) has one for each tried size.
 
         1. Project initial states and parameters out of each direction. The norm of the rest, in
            units of the noise, is the information on the coefficient.
-        2. Select the direction with the largest norm for each coefficient.
-        3. Compute its interval, and its correlations with the coefficients of other effects.
+        2. Select the direction with the largest norm.
 
         Effects that act at all places are represented by their members at single places.
         """
@@ -286,38 +329,7 @@ class _IdentifiabilityAssessment:
                 key = probe.effect, probe.coefficient_index
                 if key not in most_sensitive or norm > most_sensitive[key].norm:
                     most_sensitive[key] = _Direction(probe, norm, column / max(norm, 1e-300))
-        # 3. Intervals and correlations.
-        selected = list(most_sensitive.values())
-        unit_columns = np.array([direction.unit_column for direction in selected])
-        correlations = np.abs(unit_columns @ unit_columns.T)
-        assessments = []
-        for row, ((name, coefficient_index), direction) in zip(
-            correlations, most_sensitive.items(), strict=True
-        ):
-            parameter_index = evaluator.get_coefficient_indices(name)[coefficient_index]
-            parameter = evaluator.parameters[parameter_index]
-            probe, norm = direction.probe, direction.norm
-            half_width = Z95 / norm if norm > 0 else np.inf
-            confounders = [
-                (other_effect, float(correlation))
-                for (other_effect, _), other, correlation in zip(
-                    most_sensitive, selected, row, strict=True
-                )
-                if other_effect != name and other.norm > 0
-            ]
-            label = name
-            # An effect with several coefficients is named together with the coefficient.
-            if sum(effect == name for effect, _ in most_sensitive) > 1:
-                label += f" {parameter.name.rpartition('.')[2]}"
-            identifiability = _classify_parameter(label, False, parameter, half_width, confounders)
-            if probe.is_single_size:
-                # The effect of a limit or backlash is not proportional to it; it shows if it is
-                # reached.
-                identifiability = replace(
-                    identifiability, half=np.nan, word=_rate_switching_effect(norm)
-                )
-            assessments.append(identifiability)
-        return assessments
+        return most_sensitive
 
 
 def _rate_switching_effect(norm: float) -> IdentifiabilityLevel:

@@ -213,7 +213,7 @@ class _Totals:
             for effect, cause in zip(self.effects, causes, strict=True)
         ]
 
-    def at(
+    def compute_total(
         self, cause_index: int, coefficient: str, value: float
     ) -> tuple[float | None, float, str]:
         """Return a number of the model file as stated and with a changed coefficient, and its unit.
@@ -278,10 +278,10 @@ def _convert_to_range(
     fields = model_fields(robot, cause.effect, cause.place)
     names = [c.name for c in effect.coefficients]
     own_fields = tuple(fields[names.index(entry.coefficient)]) if fields else ()
-    nominal, value, unit = totals.at(cause_index, entry.coefficient, fitted.value)
+    nominal, value, unit = totals.compute_total(cause_index, entry.coefficient, fitted.value)
     # Ends of the interval as numbers of the file, whose order may be reversed.
-    _, first_end, _ = totals.at(cause_index, entry.coefficient, fitted.low)
-    _, second_end, _ = totals.at(cause_index, entry.coefficient, fitted.high)
+    _, first_end, _ = totals.compute_total(cause_index, entry.coefficient, fitted.low)
+    _, second_end, _ = totals.compute_total(cause_index, entry.coefficient, fitted.high)
     low, high = sorted((first_end, second_end))
     operation = operation_of(cause.effect)
     minimum, maximum = low, high

@@ -36,6 +36,7 @@ from bench.diagnosis.conventions.convention_hypotheses import (
 )
 from bench.diagnosis.conventions.signal_changes import SignalChange
 from bench.diagnosis.conventions.unit_check import Subject
+from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
@@ -52,7 +53,7 @@ from bench.diagnosis.prediction_error.filters_with_effects import (
     make_soft_friction_models,
 )
 from bench.diagnosis.prediction_error.regression_columns import group_coefficients
-from bench.diagnosis.prediction_error.regression_selection import identify
+from bench.diagnosis.prediction_error.regression_selection import Selected, identify
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
 from sims.core.plain_values import join_first_names
@@ -337,22 +338,63 @@ class ConventionComparison:
         """Return the convention with which the model predicts the recording clearly best, or None.
 
         Its log-likelihood must exceed that of the log as described by `LOG_LIKELIHOOD_MARGIN`.
-        Filtering all runs is slow, so cheap tests come first:
 
-        1. Compute the limits that a hypothesis has to exceed, on all runs and on the worst run.
-        2. Reject hypotheses by inverse dynamics, then by a filter on the worst run.
-        3. Compute the log-likelihood of the others on all runs.
-        4. Refine free offsets, and require that factors of inputs are better than no inputs.
-        5. Of equally likely hypotheses, select the simplest; the others are stated with it.
+        1. Rank the hypotheses that exceed this limit.
+        2. Refine free offsets, and require that factors of inputs are better than no inputs.
+        3. Of equally likely hypotheses, select the simplest; the others are stated with it.
 
         Args:
             recording: recording as it is described, or with some conventions corrected.
             suspects: joints whose conventions may be wrong.
         """
-        # 1. Limits. The log as described is the hypothesis without any changes.
+        # 1. Ranking. The log as described is the hypothesis without any changes.
         described = ConventionHypothesis("")
         limit = self._compute_log_likelihood(described, recording) + LOG_LIKELIHOOD_MARGIN
-        # Most hypotheses already fail on the run that the log as described explains worst.
+        ranked = self._rank_hypotheses(recording, suspects, limit)
+        # 2. Refinement of the best ones.
+        refined = [
+            self._refine_offset(score, hypothesis, recording)
+            for score, hypothesis in ranked[:MAX_REFINED]
+        ]
+        accepted = [
+            (score, hypothesis)
+            for score, hypothesis in (*refined, *ranked[MAX_REFINED:])
+            if score > limit and self._uses_inputs(score, hypothesis, recording)
+        ]
+        if not accepted:
+            return None
+        # 3. The simplest of the best.
+        best = max(score for score, _ in accepted)
+        equally_likely = [
+            hypothesis for score, hypothesis in accepted if score > best - EQUAL_LOG_LIKELIHOOD
+        ]
+        simplest, *others = sorted(equally_likely, key=lambda hypothesis: hypothesis.size)
+        # The limit contains the margin, and the gain is over the log as described.
+        gain = best - limit + LOG_LIKELIHOOD_MARGIN
+        return ConventionDifference(simplest, gain, tuple(others[: MAX_NAMED - 1]))
+
+    def _rank_hypotheses(
+        self, recording: Recording, suspects: Sequence[JointSignals], limit: float
+    ) -> list[tuple[float, ConventionHypothesis]]:
+        """Return the hypotheses that exceed a log-likelihood, the likeliest first.
+
+        Filtering all runs is slow, so cheap tests come first:
+
+        1. Find the run that the log as described explains worst, and compute the limits there.
+        2. Reject hypotheses by inverse dynamics, then by a filter, both on this run alone.
+        3. Compute the log-likelihood of the others on all runs.
+
+        Args:
+            recording: recording as it is described, or with some conventions corrected.
+            suspects: joints whose conventions may be wrong.
+            limit: log-likelihood on all runs that a hypothesis has to exceed.
+
+        Returns:
+            Log-likelihood and hypothesis. Of hypotheses with one description, which differ only in
+            an offset, only the best one is returned.
+        """
+        # 1. Limits. Most hypotheses already fail on the worst run.
+        described = ConventionHypothesis("")
         log_likelihood_by_run = [
             self._compute_log_likelihood(described, recording, run)
             for run in range(len(self._part_slices))
@@ -374,7 +416,7 @@ class ConventionComparison:
             if key in evaluated_changes:
                 continue
             evaluated_changes.append(key)
-            # 2. Cheap tests.
+            # 2. Cheap tests. Without forces to compare, the growth is NaN and rejects nothing.
             force_error_growth = (
                 self._compute_log_force_error(hypothesis, recording, worst_run) - force_error
             )
@@ -385,32 +427,10 @@ class ConventionComparison:
                 continue
             # 3. All runs.
             score = self._compute_log_likelihood(hypothesis, recording)
-            # Hypotheses that differ only in an offset share their description; the best is kept.
             best_score, _ = best_by_description.get(hypothesis.description, (limit, hypothesis))
             if score > best_score:
                 best_by_description[hypothesis.description] = score, hypothesis
-        # 4. Refinement.
-        ranked = sorted(best_by_description.values(), key=lambda scored: scored[0], reverse=True)
-        refined = [
-            self._refine_offset(score, hypothesis, recording)
-            for score, hypothesis in ranked[:MAX_REFINED]
-        ]
-        accepted = [
-            (score, hypothesis)
-            for score, hypothesis in (*refined, *ranked[MAX_REFINED:])
-            if score > limit and self._uses_inputs(score, hypothesis, recording)
-        ]
-        if not accepted:
-            return None
-        # 5. The simplest of the best.
-        best = max(score for score, _ in accepted)
-        equally_likely = [
-            hypothesis for score, hypothesis in accepted if score > best - EQUAL_LOG_LIKELIHOOD
-        ]
-        simplest, *others = sorted(equally_likely, key=lambda hypothesis: hypothesis.size)
-        # The limit contains the margin, and the gain is over the log as described.
-        gain = best - limit + LOG_LIKELIHOOD_MARGIN
-        return ConventionDifference(simplest, gain, tuple(others[: MAX_NAMED - 1]))
+        return sorted(best_by_description.values(), key=lambda scored: scored[0], reverse=True)
 
     def _compute_log_force_error(
         self, hypothesis: ConventionHypothesis, recording: Recording, run: int
@@ -553,9 +573,8 @@ class ConventionComparison:
     ) -> float:
         """Return the log-likelihood of the log as described, with the best set of causes.
 
-        Conventions must exceed it to be confirmed. Each effect is penalised by half the logarithm
-        of the number of samples for each coefficient (BIC), and by the logarithm of the number of
-        effects.
+        Conventions must exceed it to be confirmed. A cause is a missing effect, such as friction.
+        Selected effects are penalised by their number (`_fit_selected_effects`).
 
         1. Filter the segments without effects. If this diverges, the result is minus infinity.
         2. Select effects by regression of the filter's prediction errors.
@@ -596,23 +615,8 @@ class ConventionComparison:
         # A probe is an effect with the coefficients at which its response is computed.
         probes = [probe for name in names for probe in iterate_first_probes(evaluator, (), name)]
         selected = identify(filtered, compute_columns(filtered, probes))
-        samples = int(filtered.runs.recorded.sum())
-        # 3. Filters with the effects. A group has the columns of one selected effect.
-        best, penalty = filtered.log_likelihood, 0.0
-        for count, group in enumerate(selected.groups, start=1):
-            penalty += 0.5 * len(group.column_indices) * math.log(samples) + math.log(len(names))
-            groups = selected.groups[:count]
-            theta = evaluator.get_nominal_theta()
-            for effect_group, coefficients in zip(
-                groups, selected.regression.solve(groups).coefficients, strict=True
-            ):
-                theta[evaluator.coefficient_slices[effect_group.effect]] = group_coefficients(
-                    evaluator, probes, effect_group, coefficients
-                )
-            fitted = _fit_coefficients(
-                filtered.with_parameters(theta), [group.effect for group in groups]
-            )
-            best = max(best, fitted.log_likelihood - penalty)
+        # 3. Filters with the effects.
+        best, penalty = _fit_selected_effects(filtered, selected, probes, len(names))
         # 4. Effects that look like a convention.
         for name, start in _list_similar_causes(filtered, hypotheses).items():
             theta = evaluator.get_nominal_theta()
@@ -772,6 +776,48 @@ def _fit_coefficients(
         steps,
         lambda theta, best: best.with_parameters(theta),
     )
+
+
+def _fit_selected_effects(
+    filtered: FollowedRuns,
+    selected: Selected,
+    probes: Sequence[CandidateDirection],
+    effect_count: int,
+) -> tuple[float, float]:
+    """Add the effects of a regression to the model one by one, and fit their coefficients.
+
+    Each effect is penalised by half the logarithm of the number of samples for each coefficient
+    (BIC), and by the logarithm of the number of effects from which it was selected.
+
+    Args:
+        filtered: the runs, filtered without effects.
+        selected: effects that a regression selected.
+        probes: effects with the coefficients at which their responses were computed.
+        effect_count: number of effects from which the regression could select.
+
+    Returns:
+        Largest penalised log-likelihood with none or some of the effects, and the penalty of all.
+    """
+    evaluator = filtered.evaluator
+    samples = int(filtered.runs.recorded.sum())
+    best, penalty = filtered.log_likelihood, 0.0
+    # A group has the columns of one selected effect.
+    for count, group in enumerate(selected.groups, start=1):
+        penalty += 0.5 * len(group.column_indices) * math.log(samples) + math.log(effect_count)
+        groups = selected.groups[:count]
+        # The fit starts from the coefficients of the regression.
+        theta = evaluator.get_nominal_theta()
+        for effect_group, coefficients in zip(
+            groups, selected.regression.solve(groups).coefficients, strict=True
+        ):
+            theta[evaluator.coefficient_slices[effect_group.effect]] = group_coefficients(
+                evaluator, probes, effect_group, coefficients
+            )
+        fitted = _fit_coefficients(
+            filtered.with_parameters(theta), [group.effect for group in groups]
+        )
+        best = max(best, fitted.log_likelihood - penalty)
+    return best, penalty
 
 
 def _compute_log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:

@@ -126,17 +126,19 @@ def compute_drive_diagram(
     """
     joint = _Joint(subject, extended)
     zero = np.zeros(1)
-    no_load_friction = float(joint.friction(zero, zero).item())
+    no_load_friction = float(joint.compute_friction_limit(zero, zero).item())
     # Without friction either, any range shows the diagram.
     load_range = force_limit or DEFAULT_LOAD_FACTOR * no_load_friction or 1.0
     load = np.linspace(-load_range, load_range, LOAD_POINT_COUNT)
     search_range = MAX_FORCE_FACTOR * load_range
 
     def forward_balance(u: Array, p: Array) -> Array:
-        return u - p + joint.pull(u, p) - joint.friction(u, p)  # (1)
+        """Return U - P + f - F, positive where the joint moves forward."""
+        return u - p + joint.sum_other_forces(u, p) - joint.compute_friction_limit(u, p)  # (1)
 
     def backward_balance(u: Array, p: Array) -> Array:
-        return u - p + joint.pull(u, p) + joint.friction(u, p)  # (2)
+        """Return U - P + f + F, negative where the joint moves back."""
+        return u - p + joint.sum_other_forces(u, p) + joint.compute_friction_limit(u, p)  # (2)
 
     def unpowered_balance(p: Array) -> Array:
         """Return a balance that is zero where a load p starts to drive the unpowered motor.
@@ -218,7 +220,7 @@ class _Joint:
         self.stated = 0.0 if file_friction is None else file_friction.value
         self.names = tuple(law.name for law, _ in self.laws)
 
-    def friction(self, drive: Array, load: Array) -> Array:
+    def compute_friction_limit(self, drive: Array, load: Array) -> Array:
         """Compute the largest force (N,) that the friction of the joint can hold at rest.
 
         It is the sum over all friction laws.
@@ -235,7 +237,7 @@ class _Joint:
         holding_force: Array = np.maximum(np.sum(limits, axis=0), 0.0)
         return holding_force
 
-    def pull(self, drive: Array, load: Array) -> Array:
+    def sum_other_forces(self, drive: Array, load: Array) -> Array:
         """Compute the sum (N,) of the forces on the joint at rest that are not friction.
 
         An example is a constant bias. The drive force and the load are not included.
@@ -249,8 +251,8 @@ class _Joint:
         for law, coefficients in self.laws:
             if isinstance(law, Force):
                 forces.append(law.force(_expand_coefficients(coefficients, drive), moment)[:, 0])
-        pull: Array = np.sum(forces, axis=0)
-        return pull
+        total_force: Array = np.sum(forces, axis=0)
+        return total_force
 
     def _make_rest_state(self, drive: Array, load: Array) -> StateSnapshot:
         """Build the state of the joint at rest, under N pairs of drive force and load.
