@@ -258,7 +258,7 @@ class _IdentifiabilityAssessment:
         """
         evaluator = self.evaluator
         # 1. Directions.
-        most_sensitive = self._select_most_sensitive_directions()
+        most_sensitive = self._select_strongest_directions()
         # 2. Intervals and correlations.
         selected = list(most_sensitive.values())
         unit_columns = np.array([direction.unit_column for direction in selected])
@@ -293,7 +293,7 @@ class _IdentifiabilityAssessment:
             assessments.append(identifiability)
         return assessments
 
-    def _select_most_sensitive_directions(self) -> dict[tuple[str, int], _Direction]:
+    def _select_strongest_directions(self) -> dict[tuple[str, int], _Direction]:
         """Return the most sensitive direction of each coefficient, by effect and its index.
 
         A direction is the change of all samples by a coefficient. A coefficient may have several:

@@ -97,26 +97,60 @@ def _build_terms(
         by_effect.setdefault(number_range.effect, {}).setdefault(number_range.name, []).append(
             number_range
         )
-    # 1. Joints. These effects have one coefficient, and so one range at each place.
     terms: list[Term] = []
+    # 1. Joints.
+    terms += _make_joint_terms(by_effect, sentences)
+    # 2. Drives.
+    terms += _make_gain_terms(by_effect, sentences, robot)
+    # 3. Bodies.
+    terms += _make_body_terms(by_effect, sentences)
+    # 4. Gravity.
+    terms += _make_gravity_term(by_effect, sentences, robot)
+    return terms, [
+        number_range
+        for ranges_by_place in by_effect.values()
+        for ranges_at_place in ranges_by_place.values()
+        for number_range in ranges_at_place
+    ]
+
+
+def _make_joint_terms(
+    by_effect: dict[str, dict[str, list[RandomizationRange]]],
+    sentences: Mapping[RandomizationRange, str],
+) -> Iterator[Term]:
+    """Yield the terms that randomise dry friction and armature of each joint.
+
+    Args:
+        by_effect: ranges by effect and by joint; those that are used are removed.
+        sentences: comment for each range.
+    """
     for effect, key, further_notes in (
         ("friction.coulomb", "friction_distribution_params", [FRICTION_NOTE]),
         ("inertia.armature", "armature_distribution_params", []),
     ):
-        for name, (number_range,) in by_effect.pop(effect, {}).items():
-            terms.append(
-                _build_joint_term(
-                    number_range.field,
-                    name,
-                    "randomize_joint_parameters",
-                    key,
-                    _get_ends(number_range),
-                    [sentences[number_range], *further_notes],
-                )
+        # These effects have one coefficient, and so one range at each joint.
+        for joint, (number_range,) in by_effect.pop(effect, {}).items():
+            yield _build_joint_term(
+                number_range.field,
+                joint,
+                "randomize_joint_parameters",
+                key,
+                _get_ends(number_range),
+                [sentences[number_range], *further_notes],
             )
-    # 2. Drives.
-    terms += _make_gain_terms(by_effect, sentences, robot)
-    # 3. Bodies.
+
+
+def _make_body_terms(
+    by_effect: dict[str, dict[str, list[RandomizationRange]]],
+    sentences: Mapping[RandomizationRange, str],
+) -> Iterator[Term]:
+    """Yield the terms that randomise mass, centre of mass and inertia of each body.
+
+    Args:
+        by_effect: ranges by effect and by body; those that are used are removed.
+        sentences: comment for each range.
+    """
+    # Mass and inertia have one coefficient, and so one range for each body.
     for name, (number_range,) in by_effect.pop("mass.scale", {}).items():
         params = {
             "mass_distribution_params": _format_pair(*_get_ends(number_range)),
@@ -125,10 +159,8 @@ def _build_terms(
         if name in by_effect.get("inertia.scale", {}):
             # The range of the inertia already includes the scaling by the mass.
             params["recompute_inertia"] = "False"
-        terms.append(
-            _build_body_term(
-                "body_mass", name, "randomize_rigid_body_mass", params, [sentences[number_range]]
-            )
+        yield _build_body_term(
+            "body_mass", name, "randomize_rigid_body_mass", params, [sentences[number_range]]
         )
     # The centre of mass has a range for each coordinate.
     for name, offsets in by_effect.pop("mass.offset", {}).items():
@@ -138,7 +170,7 @@ def _build_terms(
         ]
         params = {"com_range": "{" + ", ".join(pairs) + "}"}
         notes = [sentences[number_range] for number_range in offsets]
-        terms.append(_build_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes))
+        yield _build_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes)
     for name, (number_range,) in by_effect.pop("inertia.scale", {}).items():
         params = {
             "inertia_distribution_params": _format_pair(number_range.minimum, number_range.maximum),
@@ -147,15 +179,7 @@ def _build_terms(
         }
         notes = [sentences[number_range], "This term exists since Isaac Lab 3."]
         function = "randomize_rigid_body_inertia"
-        terms.append(_build_body_term("body_inertia", name, function, params, notes))
-    # 4. Gravity.
-    terms += _make_gravity_term(by_effect, sentences, robot)
-    return terms, [
-        number_range
-        for ranges_by_place in by_effect.values()
-        for ranges_at_place in ranges_by_place.values()
-        for number_range in ranges_at_place
-    ]
+        yield _build_body_term("body_inertia", name, function, params, notes)
 
 
 def _make_gain_terms(

@@ -392,7 +392,24 @@ def find_wrong_units(
     if not after_by_hypothesis:
         return None
     # 4. Choice.
-    # Among hypotheses that fit equally well, the simplest is preferred.
+    return _make_simplest_error(subject, after_by_hypothesis, known_before, alternative_texts)
+
+
+def _make_simplest_error(
+    subject: Subject,
+    after_by_hypothesis: Mapping[UnitHypothesis, float],
+    before: float | None,
+    alternative_texts: Sequence[str],
+) -> RecordingFault:
+    """Return the simplest of the hypotheses that fit about equally well, as a fault.
+
+    Args:
+        subject: Recording and simulator.
+        after_by_hypothesis: RMS residual with each accepted hypothesis, in units of the noise.
+        before: RMS residual of the base model, in units of the noise; None if unknown.
+        alternative_texts: Further explanations of the misfit, which are stated as alternatives, as
+            are the other hypotheses.
+    """
     max_equal_misfit = MAX_EQUAL_RATIO * min(after_by_hypothesis.values())
     best, *others = sorted(
         (h for h, after in after_by_hypothesis.items() if after <= max_equal_misfit),
@@ -405,7 +422,7 @@ def find_wrong_units(
         if (other.signals, other.units) != (best.signals, best.units)
     ]
     return replace(
-        best.make_error(subject.file, known_before, after_by_hypothesis[best]),
+        best.make_error(subject.file, before, after_by_hypothesis[best]),
         alternatives=tuple(dict.fromkeys([*other_texts, *alternative_texts])),
     )
 

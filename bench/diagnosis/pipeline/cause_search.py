@@ -75,22 +75,7 @@ class CauseSearch:
 
         # 1. Stiff friction.
         try:
-            result = self._find_causes(base, search, rng)
-            # The search itself compares the forms of friction that it selects, but not of friction
-            # that is a free number of the model file, which is in the base model.
-            is_comparison_needed = (
-                has_dry_friction(runs.fitting, ())
-                and not result.errors
-                and not runs.context.search_control.is_over()
-            )
-            if not is_comparison_needed:
-                return result
-            soft_model = refit_if_likelier_soft(
-                search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
-            )
-            if soft_model is None:
-                return result
-            return self._search_with_soft_friction(base, search)
+            return self._search_with_stiff_friction(base, search, rng)
         # 2. Soft friction.
         except SoftFrictionError as error:
             soft_result = self._search_with_soft_friction(base, search, error.start)
@@ -100,20 +85,78 @@ class CauseSearch:
                 or runs.context.search_control.is_over()
             ):
                 return soft_result
-        # 3. Stiff friction again. With `is_form_given`, the form is tested only after effects have
-        # been fitted.
+        # 3. Stiff friction again.
+        return self._repeat_with_stiff_friction(base, search, soft_result, rng)
+
+    def _search_with_stiff_friction(
+        self, base: BaseModel, search: EffectSearch, rng: np.random.Generator
+    ) -> SearchResult:
+        """Search for causes, and compare the forms of dry friction that the base model contains.
+
+        Args:
+            base: base model, fitted with stiff friction.
+            search: search from this model.
+            rng: random generator of the search.
+
+        Returns:
+            The result, or that of a search with soft friction if that form is likelier.
+
+        Raises:
+            SoftFrictionError: the search itself has found the soft form likelier.
+        """
+        runs = base.runs
+        result = self._find_causes(base, search, rng)
+        # The search itself compares the forms of friction that it selects, but not of friction that
+        # is a free number of the model file, which is in the base model.
+        is_comparison_needed = (
+            has_dry_friction(runs.fitting, ())
+            and not result.errors
+            and not runs.context.search_control.is_over()
+        )
+        if not is_comparison_needed:
+            return result
+        soft_model = refit_if_likelier_soft(
+            search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+        )
+        return result if soft_model is None else self._search_with_soft_friction(base, search)
+
+    def _repeat_with_stiff_friction(
+        self,
+        base: BaseModel,
+        first_search: EffectSearch,
+        soft_result: SearchResult,
+        rng: np.random.Generator,
+    ) -> SearchResult:
+        """Search again with stiff friction, after soft friction did not explain the data.
+
+        The form of friction is tested only after effects have been fitted (`is_form_given`).
+
+        Args:
+            base: base model, fitted with stiff friction.
+            first_search: first search with stiff friction, whose filters are reused.
+            soft_result: result of the search with soft friction.
+            rng: random generator of the search.
+
+        Returns:
+            The result of this search. If it finds the soft form likelier again, that of a further
+            search with soft friction, or `soft_result` if that would begin with a model that was
+            fitted already.
+        """
+        # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.dry_friction_fits import SoftFrictionError
+
+        runs = base.runs
         runs.context.say(STIFF_FRICTION)
         stiff_search = runs.create_search(base.fit, rng, is_form_given=True)
-        _take_over(stiff_search, search)
+        _take_over(stiff_search, first_search)
         try:
             return self._find_causes(base, stiff_search, rng)
         except SoftFrictionError as error:
             start = error.start
-            # A soft search is repeated only from a model that the first one has not fitted.
             if start is None or frozenset(start.effects) in soft_result.search.models:
                 runs.context.say(SOFT_FRICTION)
                 return soft_result
-            return self._search_with_soft_friction(base, search, start)
+            return self._search_with_soft_friction(base, first_search, start)
 
     def _search_with_soft_friction(
         self, base: BaseModel, stiff_search: EffectSearch, likely: FitStart | None = None

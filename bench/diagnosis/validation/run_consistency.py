@@ -377,18 +377,10 @@ def _find_trend_covariate(
             return None
         return TrendCovariate(classify_constant(evaluator, grouping.by), grouping.by, trend)
     # 2. Runs or logs.
-    estimates = consistency.group_estimates
-    if len(estimates) < MIN_GROUPS_FOR_TREND:
+    if len(consistency.group_estimates) < MIN_GROUPS_FOR_TREND:
         return None
-    runs_by_group = {
-        name: list(runs) for name, runs in zip(grouping.names, grouping.runs, strict=True)
-    }
-    trends: list[tuple[RunCovariate, Trend]] = []
-    for covariate in compute_run_covariates(evaluator, model, consistency.number):
-        values = [covariate.values[runs_by_group[part.group]].mean() for part in estimates]
-        trend = _fit_trend(estimates, np.array(values))
-        if trend is not None:
-            trends.append((covariate, trend))
+    covariates = compute_run_covariates(evaluator, model, consistency.number)
+    trends = _fit_covariate_trends(covariates, grouping, consistency.group_estimates)
     # The level is corrected for the number of covariates.
     significant_trends = [
         (covariate, trend)
@@ -399,6 +391,7 @@ def _find_trend_covariate(
         return None
 
     def get_scatter(candidate: tuple[RunCovariate, Trend]) -> float:
+        """Return the mean square of the estimates about the line, in units of their errors."""
         _, trend = candidate
         # The mean square about the line is at least that of the errors, 1.
         return max(trend.mean_square, 1.0)
@@ -413,6 +406,33 @@ def _find_trend_covariate(
         and get_scatter((other_covariate, other_trend)) < COVARIATE_TIE_FACTOR * get_scatter(best)
     ]
     return TrendCovariate(covariate.kind, covariate.name, trend, tuple(similar_covariates))
+
+
+def _fit_covariate_trends(
+    covariates: Sequence[RunCovariate],
+    grouping: _RunGrouping,
+    group_estimates: Sequence[GroupEstimate],
+) -> list[tuple[RunCovariate, Trend]]:
+    """Fit the trend of a parameter with each covariate, whose value in a group is a mean over runs.
+
+    Args:
+        covariates: covariates with a value for each run.
+        grouping: the groups, with the indices of their runs.
+        group_estimates: estimate of the parameter from each group that identifies it.
+
+    Returns:
+        Each covariate with its trend; without those that are equal in all groups.
+    """
+    runs_by_group = {
+        name: list(runs) for name, runs in zip(grouping.names, grouping.runs, strict=True)
+    }
+    trends = []
+    for covariate in covariates:
+        values = [covariate.values[runs_by_group[part.group]].mean() for part in group_estimates]
+        trend = _fit_trend(group_estimates, np.array(values))
+        if trend is not None:
+            trends.append((covariate, trend))
+    return trends
 
 
 def _assess_parameter(consistency: ParameterConsistency, level: float) -> ParameterConsistency:
