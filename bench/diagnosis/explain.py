@@ -198,7 +198,17 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
     refuse_broken_conventions(runs)
 
     def fit_base(runs: SimulatedRuns) -> BaseModel:
-        """Fit the base model; for a robot with the numerical settings that the data support."""
+        """Fit the base model; for a robot with the numerical settings that the data support.
+
+        The fit ends early if the recording has wrong units, which are stored in `error_check`.
+
+        Args:
+            runs: the prepared runs.
+
+        Raises:
+            DivergingSimulationError: The runs amplify errors of the first state too much, and may
+                be cut into shorter segments.
+        """
         model = filter_and_fit(runs)
         error_check.check_base(model)
         if error_check.errors:
@@ -211,6 +221,7 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
                 f"{runs.recording.path}: the simulation amplifies errors of the first state",
                 segment_duration,
             )
+        # Another time step is only tried with the solver options of the model file.
         model = option_choice.choose(model)
         if option_choice.finding is None:
             model = step_choice.choose(model)

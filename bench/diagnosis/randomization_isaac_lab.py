@@ -106,12 +106,14 @@ def _build_terms(
     terms += _make_body_terms(by_effect, sentences)
     # 4. Gravity.
     terms += _make_gravity_term(by_effect, sentences, robot)
-    return terms, [
+    # Each of these has removed its ranges; the others have no term.
+    without_term = [
         number_range
         for ranges_by_place in by_effect.values()
         for ranges_at_place in ranges_by_place.values()
         for number_range in ranges_at_place
     ]
+    return terms, without_term
 
 
 def _make_joint_terms(

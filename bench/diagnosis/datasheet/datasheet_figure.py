@@ -240,7 +240,8 @@ def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> flo
 def _choose_table_layout(rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:
     """Choose the font size of a table, and where its columns begin.
 
-    The size is reduced until the table fits between the margins, but not below `_LEAST_SIZE`.
+    The size is reduced in steps of 0.25 points until the table fits between the margins, or is
+    below `_LEAST_SIZE`.
 
     Args:
         rows: cells of each row, with the headings as the first row.
@@ -285,8 +286,10 @@ def _draw_effects_not_shown(
     name_length = min(
         max((len(format_short_name(row)) for row in absent_rows), default=0), _NAME_LETTERS
     )
-    # A character of the monospaced font is 0.602 of its size wide.
+    # Distance of the limits from the names, as a share of the page width. A character of the
+    # monospaced font is 0.602 of its size wide, and 0.12 inches are left free.
     limit_offset = (0.602 * size / POINTS * name_length + 0.12) / page_width
+    # Maximum number of characters of a line of a limit.
     letters = int((_HALF_WIDTH - limit_offset) * page_width * POINTS / (_LETTER * size))
     lines_by_effect: list[tuple[str, list[str]]] = []
     for row in absent_rows:

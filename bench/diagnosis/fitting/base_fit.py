@@ -159,13 +159,15 @@ def fit_base_model(
 
     # 2. Longer and longer parts of the runs. A state filter has already found initial states near
     # the best ones, so that whole runs can be fitted at once.
-    for horizon in FIT_HORIZONS if evaluator.filtered_runs is None else FILTERED_FIT_HORIZONS:
+    horizons = FIT_HORIZONS if evaluator.filtered_runs is None else FILTERED_FIT_HORIZONS
+    for horizon in horizons:
         evaluator.search_control.report(f"base fit, first {horizon.share:.0%} of the runs")
         fits = TrajectoryFitter(evaluator, noise, share=horizon.share).fit_models(
             starts, horizon.iterations
         )
         starts = [fit.make_start() for fit in fits]
         best = min(fits, key=lambda fit: fit.cost)
+        # Whole runs would cost at least as much.
         if best.cost > max_cost and horizon.share < 1.0:
             return BaseFit(best, frozenset())
     # 3. Derivatives at the fitted model, by initial states. All later fits share them. Without a

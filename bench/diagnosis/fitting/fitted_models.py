@@ -297,7 +297,7 @@ class ModelSet:
         """Report the effects of the best model, and how much they explain, to the progress display.
 
         The share is the part of the base model's excess over the noise that they remove. Nothing is
-        reported if the base model is not fitted or the best one.
+        reported if the base model is not fitted, or if it is the best one.
         """
         base = self.models.get(frozenset())
         best = max(

@@ -183,6 +183,7 @@ def _select_worst_rows(report: DiagnosisReportData, view: RunView) -> list[Joint
     rows = list_joint_rows(report)
 
     def gap(row: JointRow) -> float:
+        """Return the largest RMS residual of a channel of the row with the base model."""
         return max(
             _compute_residual_rms(view, channel_index, "before")
             for channel_index in row.channels.values()

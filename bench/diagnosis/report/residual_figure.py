@@ -262,6 +262,7 @@ def _place_rows(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
             position = row_positions[-1] + (_NEXT_KIND if is_new_kind else _NEXT)
         row_positions.append(position)
         if is_new_kind:
+            # Left of the axis, a little less than a row above the first place of the kind.
             axis.text(
                 -0.035,
                 position - 0.85,

@@ -135,7 +135,7 @@ def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tup
     for side, sign in enumerate((-1.0, 1.0)):
         shifts = sign * steps
         for j, index in enumerate(fit.free_indices):
-            # At a bound the step is one-sided, so the actual difference is used as the divisor.
+            # At a bound the step is one-sided; the caller divides by the actual difference.
             theta[side, j, index] = np.clip(fit.theta[index] + shifts[j], *bounds[j])
         for state_index, shift in enumerate(shifts[parameter_count:]):
             initial_states[side, parameter_count + state_index, :, state_index] += shift
