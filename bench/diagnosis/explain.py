@@ -144,6 +144,7 @@ def _diagnose(
             closing(DiagnosisContext(attempt, worker_pool)) as context,
         ):
             runs = prepare_runs(sources, context)
+            # Whether a further attempt is possible: shorter segments that the user did not set.
             may_divide = (
                 runs.contacts.is_divisible and options.pieces is None and bool(remaining_durations)
             )
@@ -163,6 +164,7 @@ def _diagnose(
                 return
         seconds = remaining_durations.pop(0)
         attempt = replace(options, pieces=seconds)
+        # The time limit is that of all attempts together.
         if options.budget is not None:
             elapsed = time.perf_counter() - started
             attempt = replace(attempt, budget=max(options.budget - elapsed, 0.0))

@@ -475,7 +475,7 @@ class ConventionComparison:
         Args:
             score: log-likelihood with the hypothesis.
             hypothesis: assumed conventions: changed signs, units or orders of signals.
-            recording: segments of the recording.
+            recording: the recording, on whose short parts log-likelihoods are computed.
         """
         inputs = recording.runs[0].inputs
         changes = hypothesis.changes
@@ -673,6 +673,7 @@ def _cut_to_common_samples(first: Recording, second: Recording) -> tuple[Recordi
     counts = [min(run.times.size, same_run.times.size) for run, same_run in pairs]
 
     def cut(recording: Recording) -> Recording:
+        """Return a recording with only the first `counts` samples of each run."""
         runs = zip(recording.runs, counts, strict=True)
         return replace(recording, runs=tuple(run.part(slice(0, count)) for run, count in runs))
 

@@ -637,10 +637,13 @@ def _iterate_logs(description: Path) -> Iterator[LogFile]:
 def _compute_correlation(u: Array, y: Array) -> float:
     """Return the correlation of two columns; 0 if they are equal, or one does not change.
 
+    It is also 0 if the columns have different lengths or fewer than `MIN_SAMPLES` common samples.
+
     Args:
         u: (T,) first column, NaN where missing.
         y: (T,) second column.
     """
+    # A column that equals a measurement is a copy of it, and not its command.
     if u.shape != y.shape or np.array_equal(u, y, equal_nan=True):
         return 0.0
     is_recorded = np.isfinite(u) & np.isfinite(y)

@@ -366,6 +366,7 @@ class _DetectionLimitCalculator:
                     (probe.effect, probe.coefficient_index), []
                 ).append(k)
         best_shape = {key: shapes[0] for key, shapes in shapes_by_coefficient.items()}
+        # Names in the order of the candidates; the directions of these effects have a fixed size.
         switching_effects = dict.fromkeys(
             probe.effect for probe in self.direction_set.candidates if probe.is_single_size
         )
@@ -378,6 +379,7 @@ class _DetectionLimitCalculator:
                 detection_limits[name, self._get_coefficient_name(name, coefficient_index)] = (
                     self._compute_proportional_limit(new_shapes[0])
                 )
+        # The size of a limit or backlash is its first coefficient.
         for name in switching_effects:
             detection_limits[name, self._get_coefficient_name(name, 0)] = (
                 self._compute_switching_limit(name)

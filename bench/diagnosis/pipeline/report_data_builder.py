@@ -61,7 +61,7 @@ def build_report_data(
     sigma = gains.noise_sigma
     held_out, held_out_locations = _summarise_held_out(result, sigma)
     changes = tuple(_list_parameter_changes(result))
-    # A wrong unit leaves nothing to explain.
+    # With a wrong unit or sign, no cause was searched, and there is nothing to explain.
     unexplained, reasons, consistency = tuple[str, ...](), tuple[str, ...](), ConsistencySummary()
     if not verdict.recording_faults:
         unexplained = (*_list_unexplained(result), *_warn_of_bounds(changes), *notes)

@@ -209,6 +209,7 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
                 filter_simulated_runs(runs)
             tried.append(RatedOptions.rate(rated.model.refit(runs)))
         best = max(tried, key=lambda one: one.log_likelihood, default=rated)
+        # Nothing was tried, or nothing is better.
         if best is rated or not best.is_better_than(rated):
             break
         rated = best
