@@ -113,8 +113,8 @@ def _is_refuted(result: SearchResult) -> bool:
     has_held_out_gap = excess is not None and verdict_rules.misses_held_out_gap(excess, excess)
     if not extended_models or has_held_out_gap:
         return False
-    # A model that is better on the fitted runs refutes nothing if it is also better on the held-out
-    # runs, or was not evaluated there. The base model has no effects, and the key ().
+    # A model that is better on the fitted runs must be worse on the held-out runs, and must have
+    # been evaluated there. The base model has no effects, and the key ().
     held_out = finding.held_out_fits or {}
     return not any(
         names not in held_out
