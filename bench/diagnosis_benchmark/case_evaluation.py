@@ -195,6 +195,10 @@ def _diagnose_in_process(
         request: the case and its files, as the process of a diagnoser receives them.
         trained_arrays: arrays of a learned diagnoser, by name.
 
+    Returns:
+        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
+        diagnoser does not support the simulator.
+
     Raises:
         RunEndedError: the diagnoser failed.
     """
@@ -226,6 +230,10 @@ def _diagnose_isolated(
         limits: limits of the answer.
         hidden: folders that the diagnoser may not read.
 
+    Returns:
+        Answer, number of simulations, processor time and elapsed seconds; or the reason in
+        ``skipped`` if the diagnoser does not support the simulator.
+
     Raises:
         RunEndedError: the diagnoser failed.
     """
@@ -236,7 +244,7 @@ def _diagnose_isolated(
         if trained_arrays:
             deadline = perf_counter() + START_TIMEOUT_SECONDS
             child.send(b"L", *pack_arrays(trained_arrays), deadline=deadline)
-            child.receive(deadline=deadline)
+            child.receive(deadline=deadline)  # the process confirms that it has the arrays
         started_at = perf_counter()
         deadline = started_at + limits.seconds
         child.send(b"Q", json.dumps(request).encode(), deadline=deadline)

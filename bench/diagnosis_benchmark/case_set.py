@@ -127,6 +127,7 @@ def list_coefficient_names(system: str, name: str) -> list[str]:
     if system == "arm2":
         return [coefficient.name for coefficient in effect.coefficients]
     system_model = Servo.system if system == "servo" else SIMULATORS[system].system
+    # `on` gives the coefficients that the effect has on this system.
     return [coefficient.name for coefficient in effect.on(system_model)]
 
 
@@ -141,9 +142,12 @@ def render_recording(case: BenchmarkCase) -> RecordingFiles:
     record = (
         machines.record_case if case.system in machines.MACHINE_NAMES else case_sampling.record_case
     )
+    # `declared` states the units of the signals.
     recording, declared, extra_files = record(case)
     table = format_table(recording.runs, _TABLE_DIGITS)
-    return RecordingFiles(table, format_description(recording, declared, Path()), extra_files)
+    # The model file of a robot lies in the folder of the description, so its path is its name.
+    description = format_description(recording, declared, Path())
+    return RecordingFiles(table, description, extra_files)
 
 
 def write_case(case: BenchmarkCase, folder: Path, truth: bool = True) -> Path:
@@ -346,6 +350,7 @@ class CaseSpec(Document):
             return _SEED_STRIDE * seed + 10 * self.index
         text = "\x1f".join([salt, self.name])
         # Multiples of ten, as for the public seeds, leave room for the seeds of further attempts.
+        # 14 hexadecimal digits are 56 bits, too many to be guessed.
         return 10 * int(hashlib.sha256(text.encode()).hexdigest()[:14], 16)
 
 

@@ -83,6 +83,7 @@ class DiagnoserReportData:
         table, power, calibration = (
             self.tables[name] for name in ("table", "power", "calibration")
         )
+        # The column "of" has the number of recordings of a share; all diagnosers have the same.
         sizes = power[power["metric"] == "named"].drop_duplicates("size")
         return {
             "clean_count": int(table.loc[table["metric"] == "false alarms", "of"].max()),
@@ -106,6 +107,9 @@ class DiagnoserReportData:
 
     def make_interval_series(self, is_shifted: bool = False) -> tuple[Series, ...]:
         """Make a series of points with error bars for each diagnoser.
+
+        A point is a share, read from the column ``share`` of the chart's table; its error bar is
+        the 95 % interval from column ``low`` to column ``high``.
 
         Args:
             is_shifted: whether the points lie side by side on a category axis.
@@ -421,13 +425,21 @@ _MIN_LABELLED_PERCENT = 10.0
 def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
     """Draw one confusion matrix of cause families for each diagnoser.
 
-    Rows are the families of the hidden causes, columns those of the answers, in per cent of a row.
-    Cases with two hidden causes are left out.
+    A family is the part of an effect's name before the dot, as ``friction``. Rows are the families
+    of the hidden causes, columns those of the answers, in per cent of a row. Cases with two hidden
+    causes are left out.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+        title: title of the figure.
     """
     graded_rows = select_graded_answers(rows[rows["kind"] != "double"])
     graded_rows = graded_rows.assign(
         family=_list_hidden_families(graded_rows), answer=_list_answer_families(graded_rows)
     )
+    # Clean and foreign cases are the last rows. The columns begin in the order of the rows, so
+    # that correct answers are on the diagonal.
     hidden = sorted(set(graded_rows["family"]), key=lambda name: (name in _LAST_ROW_LABELS, name))
     answer_labels = [name for name in hidden if name not in _LAST_ROW_LABELS]
     answer_labels += sorted(set(graded_rows["answer"]) - {*answer_labels, *_FAMILY_LABELS})

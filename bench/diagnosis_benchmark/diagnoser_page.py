@@ -32,7 +32,11 @@ _SIGNIFICANCE_LEVEL = 0.05
 def count_own_failures(data: DiagnoserReportData) -> dict[str, tuple[int, int]]:
     """Count the incorrect graded answers of simgap itself, and all of them, by kind of case.
 
-    The report states these numbers, so that the failures of simgap itself are visible.
+    The report states these numbers, so that the failures of simgap itself are visible. Answers on
+    effects smaller than the noise are not graded.
+
+    Returns:
+        By kind of case, the number of incorrect graded answers and of all graded answers.
     """
     rows = select_graded_answers(data.rows[data.rows["diagnoser"] == REFERENCE_DIAGNOSER])
     wrong = rows[~is_correct(rows)]["kind"].value_counts()

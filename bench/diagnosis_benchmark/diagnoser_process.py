@@ -58,7 +58,7 @@ def serve_requests(
     Args:
         channel: message channel to the harness.
         policy: access policy of this process, with its own writable folder.
-        first_document: sent in the first message of this process.
+        first_document: names of the active isolation layers, which the first message reports.
     """
     channel.send_document(b"R", first_document)
     trained_arrays: Mapping[str, Array] = {}
@@ -147,6 +147,7 @@ def diagnose_case(
         (folder / name).write_text(text, encoding="utf-8")
     simulator_class = get_simulator_class(path)
     assert issubclass(simulator_class, SystemSimulator)
+    # `cannot` returns why the diagnoser does not support a simulator; empty if it does.
     if reason := diagnoser.cannot(simulator_class):
         return {"answer": None, "simulations": 0, "processor_seconds": 0.0, "skipped": str(reason)}
     recording = read_recording(path, simulator_class)
@@ -160,6 +161,7 @@ def diagnose_case(
         seconds=float(question["seconds"]),
         learned=learned,
     )
+    # Every simulation of this process counts; one more than the budget raises an error.
     SIMULATION_COUNTER.reset(case.budget)
     started_at = time.process_time()
     try:
@@ -179,7 +181,8 @@ def train_diagnoser(request: Mapping[str, Any]) -> tuple[Mapping[str, Array], in
     """Train a diagnoser for a system, with counted and limited simulations.
 
     Args:
-        request: request with ``wanted``, ``system``, ``budget`` and ``seed``.
+        request: ``wanted`` (name and code of the diagnoser), ``system`` (name of the system),
+            ``budget`` (maximum number of simulations) and ``seed``.
 
     Returns:
         The trained arrays by name, and the number of simulations used.

@@ -65,6 +65,7 @@ def write_report(
         return 0
     training = read_training_costs(folder)
     write_atomically(folder / ANSWERS_TABLE_FILE, format_csv(rows))
+    # Cases that a diagnoser does not support are listed, but count in no table.
     left_out = rows[rows["status"] == SKIPPED_STATUS]
     rows = rows[rows["status"] != SKIPPED_STATUS]
     tables = build_all_tables(rows, order, training)

@@ -150,6 +150,9 @@ class DiagnosisStudy(Study):
             jobs: number of worker processes.
             progress: makes progress callbacks; None for no progress output.
             pool: worker pool; None to create one.
+
+        Returns:
+            How many answers exist, are missing or failed, also if the run was interrupted.
         """
 
         def run_missing() -> None:
@@ -175,8 +178,8 @@ class DiagnosisStudy(Study):
     def list_run_ends(self) -> list[RunEnd]:
         """Return which answers are stored and which are missing, one entry per case and diagnoser.
 
-        Cases whose hidden cause the sensors cannot show count as done, because no
-        diagnoser is run then.
+        An entry has a label, the name of the diagnoser, a status and its reason. Cases whose hidden
+        cause the sensors cannot show count as done, because no diagnoser is run then.
         """
         answers = self.answers
         run_ends = []
@@ -186,6 +189,7 @@ class DiagnosisStudy(Study):
                 label = f"{question.name} {name}"
                 if name in self.skipped_diagnosers:
                     run_ends.append(RunEnd(label, name, "skipped", self.skipped_diagnosers[name]))
+                # ``item`` is the document of the case, empty if the case could not be drawn.
                 elif answer is not None and not answer["item"]:
                     run_ends.append(RunEnd(label, name, "done", "the sensors cannot show it"))
                 elif answer is None or name not in answer["rows"]:
@@ -247,7 +251,7 @@ class _EvaluationRun:
         if not open_questions:
             return
         # The true causes are in the memory of this process, and a diagnoser's process may run as
-        # the same user.
+        # the same user: `not_dumpable` forbids other processes to read this memory.
         trusted = self._experiment.trusted
         with nullcontext() if trusted else not_dumpable(), pool or make_pool(jobs) as workers:
             evaluated, training_costs = self._train_diagnosers(workers)
@@ -313,6 +317,7 @@ class _EvaluationRun:
         files: dict[str, dict[str, Path]] = {name: {} for name in codes}
         training_costs = []
         step = self._progress("training", len(calls)) if calls else None
+        # Results arrive in the order in which the calls end; an exception is a result, too.
         for index, result in workers.iterate_results(calls, math.inf) if calls else ():
             name, system = trainings[index]
             if isinstance(result, TrainingResult):
@@ -323,7 +328,7 @@ class _EvaluationRun:
             elif isinstance(result, RunEndedError | TimeoutError):
                 # An untrained diagnoser is evaluated all the same; its answer states what it lacks.
                 training_costs.append(TrainingCost(name, system, 0, 0.0, str(result)))
-            else:
+            else:  # an error of this program, not of the diagnoser
                 raise result
             if step:
                 step()
@@ -336,7 +341,8 @@ class _EvaluationRun:
         """Let the workers evaluate the open cases, and store the answers of each finished case.
 
         A case whose worker died or exceeded its time gets failed answers. The time limit of a case
-        is the time to draw it plus, for each diagnoser, the time of an answer and a reserve.
+        is the time to draw it plus, for each diagnoser, the time of an answer and a reserve, for
+        which the time to draw a case is used again.
 
         Args:
             workers: pool of worker processes.
@@ -402,8 +408,9 @@ def _make_failed_answers(
 def _check_code_isolated(experiment: Experiment) -> None:
     """Raise an error for diagnosers whose code is in this process, unless they are trusted.
 
-    The true causes of the cases are in the memory of this process. Diagnosers of other packages are
-    inspected in an isolated process, and represented by stubs here.
+    The true causes of the cases are in the memory of this process, so no foreign code may run in
+    it. Diagnosers of other packages are inspected in an isolated process, and represented by stubs
+    here.
 
     Args:
         experiment: configuration of the comparison.
@@ -418,6 +425,7 @@ def _check_code_isolated(experiment: Experiment) -> None:
     for registry, name in list_compared_parts(experiment):
         with suppress(PartUnavailableError):
             kind = registry.get(name)
+            # A snapshot has the classes that code of this process added; stubs are not in it.
             if not experiment.trusted and name in registry.snapshot():
                 raise InputError(
                     f"diagnoser {name}: class {kind.__qualname__} is in this process, which has "

@@ -66,13 +66,17 @@ def train_or_load(
     file is replaced.
 
     Args:
-        code: where its code is.
+        code: name of the diagnoser, and the module or plugin file of its code.
         source: hash of its code.
         system: name of the system, such as ``pendulum``.
         budget: maximum number of simulations.
         seconds: maximum time.
         hidden: folders that the diagnoser's process must not read.
         trusted: whether the diagnoser runs in this process.
+
+    Returns:
+        Path of the file with the trained arrays, and the simulations and seconds that the training
+        used when it ran.
 
     Raises:
         RunEndedError: the training failed.
@@ -87,7 +91,7 @@ def train_or_load(
         length=20,
     )
     path = get_weights_folder() / CACHE_SUBFOLDER / f"{code.name}-{system}-{key}.npz"
-    with suppress(WeightsError):
+    with suppress(WeightsError):  # missing, damaged or of another training: train
         return read_training_cost(path)
     training_request: dict[str, Any] = {
         "wanted": code.describe(),
@@ -106,12 +110,13 @@ def train_isolated(
 ) -> tuple[dict[str, Array], int, float]:
     """Train a diagnoser for a system, in an isolated process unless it is trusted.
 
-    The process gets the request in a message of kind F, and answers with kind L: the trained arrays
-    and, as one more array, the number of simulations.
+    A message has a kind of one letter. The process gets the request in a message of kind F, and
+    answers with kind L: the trained arrays and, as one more array, the number of simulations.
 
     Args:
-        code: where its code is.
-        request: request with ``wanted``, ``system``, ``budget`` and ``seed``.
+        code: name of the diagnoser, and the module or plugin file of its code.
+        request: ``wanted`` (the content of `code` as JSON), ``system``, ``budget`` (maximum number
+            of simulations) and ``seed``.
         seconds: maximum time.
         hidden: folders that the diagnoser must not read.
         trusted: whether it runs in this process.
@@ -126,7 +131,7 @@ def train_isolated(
     if trusted:
         arrays, used_simulations = diagnoser_process.train_diagnoser(request)
         return dict(arrays), used_simulations, perf_counter() - started_at
-    child = start_diagnoser_process(code, 0, hidden)
+    child = start_diagnoser_process(code, memory=0, hidden=hidden)  # memory is not limited
     try:
         deadline = started_at + seconds
         child.send(b"F", json.dumps(request).encode(), deadline=deadline)

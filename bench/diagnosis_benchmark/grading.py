@@ -101,15 +101,21 @@ def grade_sets(
 ) -> tuple[str, int, int]:
     """Grade an answer by its verdict and its named causes, depending on the kind of case.
 
+    A clean case hides nothing, so only "adequate" is right. A foreign case hides a cause that the
+    library does not contain, so the right answer is that no effect explains all. Every other kind
+    hides effects of the library, which must be named.
+
     Args:
-        kind: kind of the case; every kind but clean and foreign hides effects of the library.
+        kind: kind of the case: clean, single, double or foreign.
         effects: the hidden effects, at most two.
         verdict: the answer as a dictionary.
         equivalents: returns an effect and all effects that are equivalent to it in any data.
 
     Returns:
-        Outcome, number of effects in the set that contains them, and their number with
-        equivalent effects counted as one; see `Grade`.
+        Outcome (one word, such as right, wrong, missed or alarm); number of effects in the set of
+        alternatives that contains the true cause; and number of effects in the set that contains
+        it or an equivalent effect, equivalent effects counted as one. A number is 0 without such a
+        set.
     """
     verdict_name, size, class_size = verdict["verdict"], 0, 0
     if kind == "clean":
@@ -131,7 +137,13 @@ def _grade_library(
 
     An answer is right if each effect is in a set of its own and no set is without an effect. The
     sets are matched twice: to the effects themselves (`exact_matches`), and to effects that are
-    equivalent in any data (`equivalent_matches`). Outcomes are tested from the worst to the best.
+    equivalent in any data (`equivalent_matches`). Outcomes are tested from the worst to the best:
+
+    * unnamed: no cause is named,
+    * wrong, one: no hidden effect is named, or only one of two,
+    * extra: all are named, and another effect in addition,
+    * class: an effect is replaced by an equivalent one,
+    * set, right: all are named, in sets of several alternatives or alone.
 
     Args:
         effects: the hidden effects.

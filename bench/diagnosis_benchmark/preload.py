@@ -31,8 +31,9 @@ _NOISE_SIGMA = 1e-3
 def _warm_up_search(system: str) -> None:
     """Fit a simulated recording of a system and compute the direction of each effect.
 
-    The result is discarded: the call makes Python import and compile what every diagnosis needs,
-    once for all processes that are forked from this one.
+    A direction is the first-order change of the recording by an effect. The result is discarded:
+    the call makes Python import and compile what every diagnosis needs, once for all processes that
+    are forked from this one.
 
     Args:
         system: name of the system, such as ``pendulum``.
@@ -42,7 +43,7 @@ def _warm_up_search(system: str) -> None:
     )
     simulated = simulate_recording(specification)
     simulator_class = type(simulated.simulator)
-    assert issubclass(simulator_class, SystemSimulator)
+    assert issubclass(simulator_class, SystemSimulator)  # for the type checker
     with closing(
         RunEvaluator(simulator_class, simulated.recording, simulated.recording.training(), "batch")
     ) as evaluator:

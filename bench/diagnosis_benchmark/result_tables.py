@@ -322,9 +322,13 @@ def build_confusion_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFr
     Args:
         rows: one row per answer.
         order: names of the diagnosers.
+
+    Returns:
+        Columns ``diagnoser``, ``hidden`` (the hidden cause), ``said`` (the answer) and ``count``.
     """
     graded_rows = rows[(rows["kind"] != "double") & rows["diagnoser"].isin(order)]
-    # Cases without an effect of the library are counted under their kind, as "(clean)".
+    # Cases without an effect of the library are counted under their kind, as "(clean)": `where`
+    # replaces the rows for which the condition does not hold.
     hidden = graded_rows["hidden"].where(
         graded_rows["kind"] == "single", "(" + graded_rows["kind"] + ")"
     )
@@ -363,6 +367,10 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
     Args:
         rows: one row per answer.
         order: names of the diagnosers.
+
+    Returns:
+        One row per metric and diagnoser: number of cases (``questions``), of those that only simgap
+        or only the other one answered correctly, and the p-value before and after the correction.
     """
     columns = ["metric", "diagnoser", "questions", "only_simgap", "only_other", "p_value"]
     lines = []
@@ -497,6 +505,7 @@ def is_correct(rows: pd.DataFrame) -> pd.Series[bool]:
     most two, equivalent effects counted once; for an unmodelled cause, the statement that no effect
     of the library explains it.
     """
+    # True if all hidden effects are named, equivalent effects counted once.
     is_right = rows["found_class"].astype(bool)
     # `where` replaces the rows for which the condition does not hold.
     is_right = is_right.where(rows["kind"] != "clean", ~rows["alarm"].astype(bool))

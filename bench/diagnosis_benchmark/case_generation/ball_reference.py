@@ -50,6 +50,8 @@ class FlightDynamics:
         """
         self.g = true_system.constants["gravity"]
         self.acting = true_system.effects
+        # Pairs of a law of acceleration and its coefficients. The other causes act at impacts, on
+        # the sensors, or for a time.
         self.laws = [
             (ACCELERATION_LAWS[name], c)
             for name, c in self.acting.items()
@@ -207,6 +209,7 @@ def simulate_ball(
             resting,
         )
         time_reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
+        # The samples after the begin of this part, up to its end.
         first, last = np.searchsorted(instants, [time, time_reached], side="right")
         if last > first:
             states[first:last] = solved.sol(instants[first:last]).T
@@ -216,6 +219,7 @@ def simulate_ball(
             state[2] = radius  # the height, without the error of the event
             if not resting:
                 # Seconds of the rise, 0.4 of the time to its top, in which no impact is possible.
+                # An acceleration that is not downward is replaced by a small one.
                 _, _, az = dynamics.compute_acceleration(time, state, time)
                 rise_duration = 0.4 * state[5] / max(-az, 1e-3)
     return states

@@ -225,8 +225,9 @@ def find_coefficients(
         rng: random generator for the shape of the cause.
 
     Returns:
-        Coefficients, or None if there are none.
+        Coefficients, or None if no strength up to the maximum gives this size.
     """
+    # The shape (sign, direction, period) is drawn; the strength that scales it is searched.
     compute_coefficients = effect_coefficients.draw_effect_shape(name, setting, rng)
     compute_residual = refitted_residuals.make_gap_function(
         setting, lambda strength: _simulate_causes(setting, {name: compute_coefficients(strength)})
@@ -246,6 +247,10 @@ def _simulate_causes(setting: RecordingConditions, causes: EffectCoefficients) -
     Unmodelled causes are simulated by scipy, because the batch engine does not know them.
 
     Shapes: R runs, T samples, C channels.
+
+    Args:
+        setting: recording conditions.
+        causes: coefficients of the hidden causes by name.
     """
     if set(causes).isdisjoint(UNMODELLED_CAUSES[setting.system]):
         return refitted_residuals.simulate_observations(setting, causes)
@@ -303,6 +308,7 @@ def record_case(case: BenchmarkCase) -> RecordedCase:
     setting = restore_conditions(case)
     # Only some recordings state the noise, as those of users.
     noise = setting.noise.sigma if case.stated else {}
+    # The recording of a slider states no constants.
     constants = {} if case.system == "slider" else setting.constants
     runs = _simulate_runs(case, setting)
     recording = Recording(Path(), case.system, "", constants, noise, runs)

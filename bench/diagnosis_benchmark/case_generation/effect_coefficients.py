@@ -91,6 +91,7 @@ def draw_effect_shape(
     if (unmodelled_cause := (setting.system == "ball", name)) in UNMODELLED_SAMPLERS:
         return UNMODELLED_SAMPLERS[unmodelled_cause](BaseMotion(setting), rng)
     kind = SIMULATORS[setting.system].system.kind
+    # Strength 1 is the end of the plausible range of the first coefficient.
     coefficient_scale = max(
         abs(bound) for bound in library.get_effect(name).coefficients[0].range(kind)
     )
@@ -295,7 +296,7 @@ def _draw_power_law(
     """Return a power law of the input that keeps the peak of the input unchanged.
 
     The effect multiplies the input u by (1 + gain) |u|^s, with the strength s as power. The gain
-    that keeps the peak is peak^-s - 1.
+    is peak^-s - 1, because then the factor is 1 for |u| = peak.
 
     Args:
         coefficient_scale: unused, as `rng`: all samplers of shapes have the same arguments.
@@ -334,7 +335,8 @@ def _draw_quadratic_friction(
     It is friction that depends on the transmitted load.
 
     Args:
-        coefficient_scale: linear coefficient at strength 2.
+        coefficient_scale: end of the plausible range of the linear coefficient, which is half of it
+            at strength 1.
         motion: motion without hidden causes.
         rng: random generator.
 
@@ -586,7 +588,10 @@ def _draw_growing_damping(motion: BaseMotion, rng: np.random.Generator) -> Coeff
 
     Args:
         motion: scales of the motion without hidden causes.
-        rng: random numbers of the case.
+        rng: unused; all samplers have the same arguments.
+
+    Returns:
+        Function from the strength to the growth of the damping per second.
     """
     max_growth = (0.1 if motion.system == "pendulum" else 5.0) / motion.seconds
     return lambda strength: (max_growth * strength,)
@@ -658,6 +663,9 @@ def _draw_changing_restitution(motion: BaseMotion, rng: np.random.Generator) -> 
     Args:
         motion: scales of the motion without hidden causes.
         rng: random numbers of the case.
+
+    Returns:
+        Function from the strength to the rate c of the law e0 (1 - c t), 1/s, of either sign.
     """
     sign = float(rng.choice([-1, 1]))
     return lambda strength: (sign * strength / motion.seconds,)

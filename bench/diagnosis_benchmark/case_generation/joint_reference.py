@@ -101,6 +101,7 @@ class JointDynamics:
             push, duration, *start_times = true_system.effects["gust"]
             push_start = start_times[number]
             self.breaks = [push_start, push_start + duration]
+            # The middle of the integrated interval decides, so that the force does not jump in it.
             self.forces.append(
                 lambda t, x, v: push if push_start <= self.middle < push_start + duration else 0.0
             )
@@ -131,13 +132,13 @@ class JointDynamics:
         return self.segment.evaluate(t)
 
     def compute_force(self, t: float, x: float, v: float, *z: float) -> float:
-        """Compute the force on the coordinate, without dry friction.
+        """Compute the force on the coordinate, without dry friction, in N or N·m.
 
         Args:
             t: time.
             x: position.
             v: velocity.
-            *z: states of the hidden-state effects.
+            *z: states of the hidden-state effects (driven loads, hysteresis), two for each.
         """
         total = self.drive(t) + self.weight(x)
         for force in self.forces:
@@ -152,7 +153,10 @@ class JointDynamics:
         Args:
             x: position.
             v: velocity.
-            *z: states of the hidden-state effects.
+            *z: states of the hidden-state effects (driven loads, hysteresis), two for each.
+
+        Returns:
+            Derivatives in the order of `z`.
         """
         parts = zip(self.hidden_state_effects, pair_up(z), strict=True)
         return [rate for part, part_states in parts for rate in part.rates(x, v, *part_states)]
@@ -453,10 +457,13 @@ def compute_end_stop_force(
     Args:
         x: position.
         v: velocity.
-        stiffness: force at a depth of 0.01, divided by that depth; its sign is the side of the
-            stop.
+        stiffness: force at a depth of 0.01 (m or rad), divided by that depth; its sign is the side
+            of the stop.
         position: position of the stop.
-        loss: damping, as a factor of the approach velocity.
+        loss: damping, as a factor of the approach velocity, s/m or s/rad.
+
+    Returns:
+        |stiffness| depth^1.5 / 0.1 (1 + loss approach velocity), in N or N·m; never a pull.
     """
     # 0.1 is the root of the depth 0.01, so that the force there is stiffness times depth.
     side = copysign(1.0, stiffness)
@@ -523,13 +530,16 @@ def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, stat
     """Integrate to the end of the input interval, from one standstill to the next.
 
     Args:
-        joint: the equation of motion.
-        state: state at the begin of the interval.
+        joint: the equation of motion, with its input interval.
+        state: position, velocity and hidden states at the begin of the interval.
         instants: times of the samples, (T,).
-        states: receives positions and velocities, (T, 2).
+        states: receives positions and velocities at the samples within the interval, (T, 2).
 
     Returns:
         State at the end.
+
+    Raises:
+        RuntimeError: the joint stops more than 10,000 times in the interval.
     """
     time, end = joint.segment.begin, joint.segment.end
     for _ in range(10_000):
@@ -591,7 +601,7 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
         return float(direction * y[1])
 
     stop_event: Any = compute_directed_velocity
-    stop_event.terminal, stop_event.direction = True, -1
+    stop_event.terminal, stop_event.direction = True, -1  # positive before the stop
     events = stop_event if joint.limits else None
     with_friction, without_friction = MAX_FIRST_STEPS
     max_first_step = with_friction if joint.limits else without_friction
@@ -601,6 +611,7 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
         "first_step": min(max_first_step, end - start),
         **SOLVER_TOLERANCES,
     }
+    # In a short interval, the method of order 5 costs less than the one of order 8.
     method: Any = "RK45" if end - start < INTERPOLATION_INTERVAL else "DOP853"
     solved = solve_ivp(compute_derivatives, (start, end), state, method, events=events, **settings)
     if not solved.success:
@@ -667,6 +678,7 @@ def _find_break_away(joint: JointDynamics, start: float, x: float) -> float:
     def excess(t: float) -> float:
         return abs(joint.compute_force(t, x, 0.0)) - joint.compute_friction_limit(t, x, 0.0)
 
+    # About 500 grid points per second.
     grid: Sequence[float] = np.linspace(start, end, max(3, int(500 * (end - start)))).tolist()
     for left_time, right_time in pairwise(grid):
         if excess(right_time) > 0:

@@ -82,10 +82,15 @@ class SensorNoise:
         Args:
             observed: noise-free observations, (T, C).
             rng: random generator.
+
+        Returns:
+            Noisy observations, (T, C).
         """
         sigma = np.array(list(self.sigma.values()))
         white = rng.standard_normal(observed.shape)
-        if self.kind == "quantised":  # rounding has the standard deviation step / sqrt(12)
+        if self.kind == "quantised":
+            # Rounding has the variance step^2 / 12 and the dither (dither step)^2; the step makes
+            # their sum sigma^2.
             step = sigma / np.sqrt(1 / 12 + self.dither**2)
             rounded: Array = np.round((observed + self.dither * step * white) / step) * step
             return rounded
@@ -170,6 +175,10 @@ def draw_conditions(
         rng: random generator.
         hidden: names of the hidden effects.
         requested: conditions that are given; those that are None are drawn.
+
+    Returns:
+        True parameters, runs (sample times, initial states and inputs), channels, sensor noise,
+        rate (Hz) and length of a run (s).
     """
     # Rate in Hz and length of a run in s.
     rate = int(rng.choice([50, 100, 200], p=[0.3, 0.5, 0.2]))
@@ -322,7 +331,8 @@ def _draw_slider_conditions(
         # Lowest and highest frequency in Hz.
         force = draw_input_signal(signal_form, times, rng, (0.3, 2.0))
         force -= force.mean()  # otherwise the slider drifts away
-        # Range of the position, m, by integrating the acceleration twice.
+        # Range of the position for a force of amplitude 1 N, m, by integrating the acceleration
+        # twice. The times begin at 0, so times[1] is the sampling interval.
         travel = np.ptp(np.cumsum(np.cumsum(force))) * times[1] ** 2 / parameters["mass"]
         amplitude = np.clip(rng.uniform(0.4, 2.5) / travel, 0.5, 8.0)  # N
         scenarios.append(Scenario(times, start, {"u": force * amplitude}))
@@ -336,9 +346,9 @@ def draw_input_signal(
 
     Args:
         form: steps (between random levels), sine, or chirp (a sine whose frequency increases).
-        times: sample times, (T,).
+        times: sample times from 0 on, s, (T,).
         rng: random generator.
-        hertz: range of frequency, Hz.
+        hertz: range of frequency, Hz, in which frequencies are drawn log-uniformly.
 
     Returns:
         Signal, (T,).
@@ -355,7 +365,8 @@ def draw_input_signal(
     cycles = low * times
     if form == "chirp":
         cycles = cycles + (high - low) * times**2 / (2 * times[-1])
-    signal: Array = np.sin(2 * np.pi * (cycles + rng.random()))
+    random_phase = rng.random()  # in cycles
+    signal: Array = np.sin(2 * np.pi * (cycles + random_phase))
     return signal
 
 
@@ -429,8 +440,9 @@ class BenchmarkCase(Document):
         """Hide causes in a case, unless a wrong answer would explain the recording as well.
 
         A wrong answer is the simpler form of a single effect, one of two effects, or the best
-        effect of the library for an unmodelled cause. The residual that it leaves must be at least
-        `MIN_SIMPLER_RESIDUAL` for a simpler form, otherwise `MIN_DISTINCT_SIZE`.
+        effect of the library for an unmodelled cause (one that no effect describes). The residual
+        that it leaves must be at least `MIN_SIMPLER_RESIDUAL` for a simpler form, otherwise
+        `MIN_DISTINCT_SIZE`.
 
         Args:
             causes: names of the causes.
@@ -488,11 +500,11 @@ def name_case(
 def draw_size(kind: str, size: float | None, rng: np.random.Generator) -> float:
     """Return the size of the hidden causes in units of the noise; draw it unless it is requested.
 
-    It is log-uniform from 1 to 10, or from 3 for double and foreign causes, which must be clearly
-    visible.
+    It is log-uniform from 1 to 10, or from 3 for cases of kind double (two effects) and foreign (a
+    cause that no effect of the library describes), which must be clearly visible.
 
     Args:
-        kind: one of `CASE_KINDS`.
+        kind: kind of the case: clean, single, double or foreign.
         size: requested size; None to draw it.
         rng: random generator.
     """
@@ -517,6 +529,7 @@ class RecordedCase(NamedTuple):
 def make_case_rng(name: str, purpose: str) -> np.random.Generator:
     """Return the random generator of a case for one purpose, such as its noise.
 
-    The stream follows from both names alone, so a case needs no stored data.
+    The stream follows from both names alone, so the recording of a case can be simulated again and
+    need not be stored.
     """
     return np.random.default_rng(list(f"{name} {purpose}".encode()))

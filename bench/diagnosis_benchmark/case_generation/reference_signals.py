@@ -73,9 +73,9 @@ def compute_applied_input(
 ) -> list[InputSegment]:
     """Compute the first input as applied to the plant, from time 0 to `end_time`.
 
-    The hidden effects change the commands between sensor and plant. The result is divided into
-    segments in which the input is constant or approaches a constant exponentially, so that a solver
-    never meets a jump. Without an input, only a constant offset remains.
+    The hidden effects change the recorded command on its way to the plant. The result is divided
+    into segments in which the input is constant or approaches a constant exponentially, so that a
+    solver never meets a jump. Without an input, only a constant offset remains.
 
     Args:
         scenario: scenario of the run: times, initial state, inputs and constants.
@@ -156,6 +156,7 @@ def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array
     Returns:
         Levels and begins of the parts.
     """
+    # Relative times of the middles of the parts: each part has the level of its middle.
     parts = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS
     fine_levels = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
     starts = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(SUBDIVISIONS) / SUBDIVISIONS

@@ -101,7 +101,8 @@ def simulate_with_scipy(
             instants = instants - coefficients[0]
         elif name == "clock.skew":
             instants = instants * (1 + coefficients[0])
-    # The motion is known from time 0 on: before it, a delayed sensor shows the initial state.
+    # The motion is known from time 0 on: before it, a delayed sensor shows the initial state. The
+    # simulation needs times that do not decrease.
     instants = np.maximum.accumulate(np.maximum(instants, 0.0))
     grid, sample_indices = (
         _refine_time_grid(instants)
@@ -115,6 +116,7 @@ def simulate_with_scipy(
     )
     states = simulate_motion(true_system, scenario, number, grid)
     observed = states[:, [CHANNELS[true_system.system].index(name) for name in channels]]
+    # Effects of one sensor act on one channel, a lag on all of them.
     read_column = _get_read_column(true_system.system, channels)
     for name, coefficients in true_system.effects.items():
         if name in SENSOR_EFFECTS:
@@ -153,7 +155,7 @@ def simulate_with_mujoco(
     simulator = kind(true_system.constants, channels, engine=engine, fixed=effects, time_step=step)
     theta = np.array([[true_system.parameters[p.name] for p in kind.system.parameters]])
     try:
-        observed: Array = simulator.simulate(theta, scenario)[0]
+        observed: Array = simulator.simulate(theta, scenario)[0]  # theta has one row
         return observed
     finally:
         simulator.close()

@@ -111,12 +111,13 @@ class NuisanceFitter:
         that does not decrease the sum of squares increases the damping, another one decreases it.
         The fit stops when the RMS residual hardly decreases.
 
-        Shapes: R runs, T samples, C channels.
+        Shapes: R runs, T samples, C channels, S states.
 
         Args:
             observed: observations, (R, T, C).
-            theta: starting values of parameters and coefficients; None for those of the conditions.
-            starts: starting values of the initial states, (R, S); None for those of the conditions.
+            theta: starting values of parameters and coefficients; None for the true parameters and
+                the nominal coefficients.
+            starts: starting values of the initial states, (R, S); None for the true ones.
             rounds: maximum number of iterations.
 
         Returns:
@@ -154,8 +155,8 @@ class NuisanceFitter:
         keeps the matrix regular if an unknown has no influence.
 
         Args:
-            residual: residual, (N,).
-            slope: Jacobian in units of the scales, (N, P).
+            residual: N residuals, observed minus simulated, (N,).
+            slope: Jacobian of the simulation for P unknowns, in units of their scales, (N, P).
             damping: damping factor of the diagonal.
 
         Returns:
@@ -309,7 +310,9 @@ def compute_refitted_residual(
     fit = NuisanceFitter(setting, [name])
     if coefficients is not None:
         return fit(observed, [*setting.parameters.values(), *coefficients]).rms_residual
-    guesses = _rank_starts(setting, observed, name, NuisanceFitter(setting)(observed))
+    base_fit = NuisanceFitter(setting)(observed)  # without the effect
+    # Pairs of first-order residual and starting values, the best first.
+    guesses = _rank_starts(setting, observed, name, base_fit)
     return min(fit(observed, guess).rms_residual for _, guess in guesses[:STARTS_PER_EFFECT])
 
 
@@ -371,7 +374,7 @@ def _rank_starts(
         peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
         guesses = [(share * peak,) for share in SATURATION_SHARES]
     elif name == "state.limit":
-        guesses = list(_iterate_stop_starts(setting, observed[..., 0]))
+        guesses = list(_iterate_stop_starts(setting, observed[..., 0]))  # channel 0: position
     else:
         guesses = []
     if guesses:

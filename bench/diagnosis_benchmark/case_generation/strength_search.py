@@ -24,14 +24,18 @@ BRACKET_MARGIN = 0.05
 
 
 def compute_orthonormal_basis(columns: Array) -> Array:
-    """Compute an orthonormal basis (N, K) of the span of columns by singular value decomposition.
+    """Compute an orthonormal basis of the span of columns by singular value decomposition.
 
     Directions with a singular value below 1e-6 of the largest are left out, because they come from
     columns that are nearly dependent.
 
     Args:
-        columns: columns, (N, P).
+        columns: P columns of N numbers, (N, P).
+
+    Returns:
+        Basis of K <= P orthonormal columns, (N, K).
     """
+    # Columns of length 1, so that their units do not decide which ones are nearly dependent.
     scale = np.sqrt(np.square(columns).sum(axis=0))
     left_vectors, singular_values, _ = np.linalg.svd(
         columns / np.where(scale > 0, scale, 1.0), full_matrices=False

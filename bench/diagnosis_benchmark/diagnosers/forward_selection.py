@@ -87,12 +87,13 @@ class _ForwardSelection(Diagnoser):
             evidence: fitted base model and directions of the effects.
         """
         samples = int(evidence.observed_mask.sum())
-        best = _add_refit(evidence, evidence.base.fit)
+        best = _measure_fit(evidence, evidence.base.fit)
         base_model = best
         causes: list[tuple[str, tuple[str, ...]]] = []
         while len(causes) < MAX_EFFECTS and not self._is_sufficient(best, samples):
             candidates = [
-                _add_refit(evidence, fit) for fit in _refit_with_one_more_effect(evidence, best.fit)
+                _measure_fit(evidence, fit)
+                for fit in _refit_with_one_more_effect(evidence, best.fit)
             ]
             candidates = [candidate for candidate in candidates if np.isfinite(candidate.squares)]
             if not candidates:
@@ -244,7 +245,7 @@ class ForwardChi2(_ForwardSelection):
         return float(chdtrc(max(samples - model.numbers, 1), model.squares))
 
 
-def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedModel:
+def _measure_fit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedModel:
     """Compute sum of squares and number of parameters of a fit, by which models are compared.
 
     Unknown initial states count as parameters.
@@ -321,6 +322,8 @@ def _choose_starts(
         effects: columns of all directions after this projection, (N, K).
     """
     evaluator, name = evidence.evaluator, column.effect
+    # A probe has the coefficients with which a direction was simulated, and the index of the one
+    # that scales it.
     probes = [evidence.sensitivity_directions.candidates[index] for index in column.places]
     bounds = compute_coefficient_bounds(evaluator, name)
     sizes, *_ = np.linalg.lstsq(effects[:, list(column.places)], residual, rcond=1e-9)

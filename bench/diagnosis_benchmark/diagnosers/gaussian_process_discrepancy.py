@@ -47,6 +47,7 @@ class GaussianProcessDiscrepancy(Diagnoser):
         """
         with closing(RegressionEvidence.collect(case)) as evidence:
             rows = evidence.build_acceleration_regression()
+        # `fitted` and `held_out` are the indices of the runs for fitting and of the others.
         p_value = _compute_gain_p_value(
             rows.select_runs(evidence.fitted), rows.select_runs(evidence.held_out), case.rng
         )

@@ -116,6 +116,9 @@ def _run_command(prompt: str, seconds: float) -> str:
         prompt: text on the command's standard input.
         seconds: time limit.
 
+    Returns:
+        The command's standard output.
+
     Raises:
         InputError: there is no command, it fails, or it takes too long.
     """

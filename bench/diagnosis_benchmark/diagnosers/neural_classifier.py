@@ -196,7 +196,7 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
         rate=float(rng.choice([50, 100])),
         engine="batch",
         seed=int(rng.integers(1 << 31)) + number,
-        force=True,
+        force=True,  # without a check of the machine's resources
     )
     image, residual_rms = _compute_network_input(kind, simulate_recording(specification).recording)
     min_residual, max_residual = TRAINING_RESIDUAL_RANGE

@@ -64,7 +64,7 @@ class EffectColumn:
         """Return the directions of the column that are not zero, with length one, (N, D).
 
         Args:
-            effects: all directions, (N, K).
+            effects: all K directions with N rows each, (N, K); D of them belong to the column.
         """
         part = effects[:, list(self.places)]
         scale = np.sqrt(np.square(part).sum(axis=0))
@@ -98,6 +98,8 @@ class RegressionData:
 
     def project_out_base(self) -> tuple[Array, Array]:
         """Project out parameters and initial states: what they can explain is not evidence.
+
+        Shapes: N rows (one per sample), K directions of effects.
 
         Returns:
             The residual (N,) and the effect columns (N, K), without the part that parameters and
@@ -182,10 +184,12 @@ class RegressionEvidence:
         A nonlinear parameter, such as a period, has a grid of values; the directions at one value
         form one column.
         """
+        # Indices of directions by effect, grid point and, for a direction of a fixed size, index.
         groups: dict[tuple[str, int, int], list[int]] = {}
         for i, probe in enumerate(self.sensitivity_directions.candidates):
-            # Each direction of a fixed size is a column of its own, because such directions do not
-            # add up; -1 is common to all others.
+            # A direction such as that of an end stop is valid only at the size at which it was
+            # simulated. Such directions do not add up, so each is a column of its own; -1 is common
+            # to all others.
             separate_index = i if probe.is_single_size else -1
             groups.setdefault((probe.effect, probe.grid_point, separate_index), []).append(i)
         return [EffectColumn(effect, tuple(indices)) for (effect, _, _), indices in groups.items()]
@@ -195,6 +199,9 @@ class RegressionEvidence:
 
         To first order r = J delta + D c + noise (1), with the derivatives J by parameters and
         initial states, their changes delta, the directions D of the effects and their sizes c.
+
+        Returns:
+            r, J and D, with each row in units of its noise.
         """
         fit = self.base.fit
         runs, length, channels, _ = fit.jacobian.shape
@@ -212,11 +219,15 @@ class RegressionEvidence:
         """Build the regression of accelerations: the operator L of (2) applied to equation (1).
 
         Accelerations show forces at the moment at which they act, while trajectories integrate
-        them. The operator L r = r'' - A r - B r' (2) is applied to both sides of r = J delta + D c
-        + noise (1); see `_apply_residual_operator`.
+        them. The operator L r = r'' - A r - B r' (2), with the stiffness A and damping B of the
+        motion, is applied to both sides of r = J delta + D c + noise (1), with the derivatives J by
+        parameters and initial states and the directions D of the effects.
 
         Args:
             seconds: window of the local polynomials.
+
+        Returns:
+            L r, L J and L D, with each row in units of its noise.
         """
         residual, sigma, is_observed = self._apply_residual_operator(
             self.residual[..., None], seconds
@@ -239,7 +250,7 @@ class RegressionEvidence:
         Each row is divided by its noise. Rows that are masked, or not finite because of an impact,
         are left out.
 
-        Shapes: R runs, T samples, C channels.
+        Shapes: R runs, T samples, C channels, B parameters and initial states, K directions.
 
         Args:
             residual: residual, (R, T, C).
@@ -296,7 +307,8 @@ class RegressionEvidence:
         Shapes: R runs, T samples, C channels.
 
         Args:
-            values: trajectories, (R, T, C, K).
+            values: K sets of trajectories, such as the residual or the directions of effects,
+                (R, T, C, K).
             seconds: window of the local polynomials.
 
         Returns:
@@ -315,6 +327,7 @@ class RegressionEvidence:
         for run_index, run_data in enumerate(evaluator.prepared_runs):
             size = int(evaluator.lengths[run_index])
             step = float(np.median(np.diff(run_data.scenario.times)))
+            # Number of samples of the window, at most half of a short run.
             window = _round_down_to_odd(
                 min(max(MIN_WINDOW_SAMPLES, round(seconds / step)), size // 2)
             )
@@ -381,6 +394,7 @@ class RegressionEvidence:
         half_window = window // 2
         is_smooth[:half_window] = is_smooth[size - half_window :] = False
         system = self.evaluator.simulator.system
+        # The last coordinate of a system that bounces is its height.
         name = system.coordinates[-1] if system.bounces else ""
         if name in self.evaluator.channels:
             channel_index = self.evaluator.channels.index(name)
@@ -395,8 +409,9 @@ class RegressionEvidence:
         """Compute A and B of L r = r'' - A r - B r' (2), each (T, D), by finite differences.
 
         They are the derivatives of the base model's acceleration by the coordinate and by its rate
-        (stiffness and damping, per mass), along the fitted motion. They are zero for systems of
-        several coordinates (D > 1), and if the coordinate is not recorded.
+        (stiffness and damping, per mass), along the fitted motion with T samples and D coordinates.
+        They are zero for systems of several coordinates (D > 1), and if the coordinate is not
+        recorded.
 
         Args:
             run: index of the run.
@@ -508,9 +523,12 @@ def find_strongest_columns(
 ) -> dict[str, StrongestColumn]:
     """Find for each effect the column that explains most of the residual.
 
+    With the directions A of a column and b = A^T r for the residual r, a least-squares fit of the
+    column decreases the sum of squares by b^T (A^T A)^-1 b.
+
     Args:
-        residual: residual after projection (`RegressionData.project_out_base`), (N,).
-        effects: directions of all effects after projection, (N, K).
+        residual: N values after the part that parameters explain is projected out, (N,).
+        effects: K directions of all effects after the same projection, (N, K).
         columns: columns of the effects; each is one or several of these directions.
 
     Returns:

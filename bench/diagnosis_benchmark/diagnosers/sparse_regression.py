@@ -69,13 +69,14 @@ class _SparseRegression(Diagnoser):
         valid_results = [result for result in results if result is not None]
         if not valid_results:
             return Answer("unidentifiable")
+        # `sigmas` is the improvement of the prediction in standard errors.
         best = max(valid_results, key=lambda result: result.sigmas)
         if not best.causes:
             return Answer("adequate")
         if len(best.causes) > MAX_TERMS:
             return Answer("unknown")
-        sets = any(cause.alternatives for cause in best.causes)
-        return Answer("ambiguous" if sets else "named", best.causes)
+        has_alternatives = any(cause.alternatives for cause in best.causes)
+        return Answer("ambiguous" if has_alternatives else "named", best.causes)
 
     def _run_regression(
         self, evidence: RegressionEvidence, window: float
@@ -128,7 +129,11 @@ class _SparseRegression(Diagnoser):
         )
         # An effect with several directions may have several terms.
         selected_effects = list(
-            dict.fromkeys(effect for (effect, _), size in zip(terms, model, strict=True) if size)
+            dict.fromkeys(
+                effect
+                for (effect, _), coefficient in zip(terms, model, strict=True)
+                if coefficient != 0
+            )
         )
         causes = [
             NamedCause(

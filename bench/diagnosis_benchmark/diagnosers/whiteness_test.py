@@ -47,7 +47,9 @@ class WhitenessTest(Diagnoser):
             if p_value >= FALSE_ALARM_RATE:
                 return Answer("adequate", p_value=p_value)
             rows = evidence.build_trajectory_regression()
+            # Without the part that parameters and initial states explain.
             residual, effects = rows.project_out_base()
+            # By effect, the decrease of the sum of squares by its best column.
             best = find_strongest_columns(residual, effects, evidence.effect_columns)
         # The correlation is the root of the fraction of the sum of squares that a column explains.
         total = float(residual @ residual)
@@ -78,7 +80,7 @@ def _compute_whiteness_p_value(evidence: RegressionEvidence) -> float:
     from statsmodels.stats.diagnostic import acorr_ljungbox
 
     p_values = []
-    runs, _, channels = evidence.residual.shape
+    runs, _, channels = evidence.residual.shape  # (R, T, C)
     for run_index in range(runs):
         for channel_index in range(channels):
             values = evidence.residual[run_index][

@@ -9,10 +9,12 @@ MODEL_FILE_NAME = "robot.xml"
 
 
 def render_arm_mjcf(numbers: Mapping[str, float]) -> str:
-    """Render the MJCF text of an arm.
+    """Render the MJCF text of an arm of two links, with joints `shoulder` and `elbow`.
 
     Args:
-        numbers: parameters; see `machine_dynamics.ArmDynamics`.
+        numbers: parameters in SI units: ``length`` of the upper arm; and for the links 1 (upper
+            arm) and 2 (forearm), ``mass1``, ``centre1`` (distance of the centre of mass from the
+            joint), ``inertia1`` (about the centre of mass), ``damping1`` and ``armature1``.
     """
     # The names of a link's parameters end with its number.
     inner_link, outer_link = (

@@ -97,6 +97,9 @@ STRIBECK_FORCE_SHARE = 0.3
 def list_effect_places(system: str, effect: str) -> tuple[str, ...]:
     """List the places of an effect or unmodelled cause, as ``effect@place`` or ``effect`` alone.
 
+    Places are joints, bodies, motors or channels. Gravity acts on the whole machine, and a servo
+    has one joint only, so these need no place.
+
     Args:
         system: servo or arm2.
         effect: name of the effect or cause.
@@ -268,7 +271,8 @@ def _draw_unmodelled_cause(
         rng: random generator.
 
     Returns:
-        Numbers of the cause as a function of the strength.
+        Function from the strength to the numbers of the cause: force (N·m), begin and duration (s)
+        of a gust, or friction limit (N·m), centre and half width (rad) of a patch.
     """
     force = float(setting.motion_scales["force"][joint])
     if cause == "gust":

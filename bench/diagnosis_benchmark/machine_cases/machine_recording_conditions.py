@@ -262,7 +262,9 @@ def _draw_runs(
     # Signals have amplitude 1.
     commands = commands * amplitude * rng.uniform(0.5, 1.0, (count, 1, joints))
     for _ in range(MAX_COMMAND_ATTEMPTS):
+        # The initial velocities are zero.
         runs = MachineRuns(times, commands, initial_positions, np.zeros_like(initial_positions))
+        # Largest angle of each run, over all steps and joints.
         max_angles = np.abs(simulate_machine(plant, runs, coarse=2.0).q).max(axis=(0, 2))
         if (max_angles <= MAX_JOINT_ANGLE).all():
             break

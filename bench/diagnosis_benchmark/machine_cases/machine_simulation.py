@@ -231,6 +231,7 @@ class _MachineIntegrator:
         )
         if not has_stopped.any():
             return
+        # On the line from `velocity_before` to v, the part after zero is the share v / (v - v0).
         with np.errstate(divide="ignore", invalid="ignore"):
             remaining_time = np.where(has_stopped, self.v / (self.v - velocity_before), 0.0) * h
         # The motion after the time of rest, in the wrong direction, is taken back.
