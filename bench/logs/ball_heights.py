@@ -108,8 +108,8 @@ def compute_heights_by_scale(
 
     The heights are z = radius + S (q_ground - q) (2), where q is the position along the fall
     (downwards positive) divided by the ball's radius, both in pixels. The unknown factor S is the
-    known radius, or the factor with which the ball falls at g. If both are known but differ, a note
-    says so.
+    known radius in metres, which holds for a level camera, or the factor with which the ball falls
+    at g. If both are known but differ, a note says so.
 
     Args:
         track: Track of the ball in the image.
@@ -238,7 +238,14 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
 
 
 def _compute_gravity_scale(flights: list[_Flight]) -> float | None:
-    """Return the S for which the flights fall with gravity; None without a falling flight."""
+    """Return the factor S for which the flights fall with gravity; None without a falling flight.
+
+    S converts positions q, in ball radii and downwards positive, to metres: q'' = g / S (3). The
+    mean of q'' over all flights is weighted by the accuracy of each flight.
+
+    Args:
+        flights: parabolas q(t) of the flights; the first coefficient is q'' / 2.
+    """
     falling_flights = [flight for flight in flights if flight.curve[0] > 0]
     if not falling_flights:
         return None

@@ -82,11 +82,15 @@ def track_film(
     Args:
         video: Path of the film.
         out: Path NAME.csv of the new recording; description and figure are written next to it.
-        draw: Function that draws the figure (`figures.ball_track_figure.render_track_figure`).
+        draw: Function that draws the figure (`figures.ball_track_figure.render_track_figure`) and
+            returns it as a PNG and, if requested, a PDF.
         diameter: Diameter of the ball, m.
         fps: Frames per second, instead of the file's time stamps.
         scale: "camera", "diameter" or "fall"; None for the best available one.
         pdf: Whether `draw` makes a PDF, too.
+
+    Returns:
+        Counts of frames, noise, and notes and lines to show to the user.
 
     Raises:
         InputError: The film cannot be tracked or the files cannot be written; one line.
@@ -216,6 +220,5 @@ def _build_recording(
     )
     title = f"{video.name}, tracked; z {heights.method}"
     constants = {"radius": heights.radius, "gravity": ball_heights.DEFAULT_GRAVITY}
-    return Recording(
-        Path(), BallSystem.name, title, constants, {"z": noise}, (run,), dict.fromkeys(pixels, "px")
-    )
+    extra_units = dict.fromkeys(pixels, "px")
+    return Recording(Path(), BallSystem.name, title, constants, {"z": noise}, (run,), extra_units)

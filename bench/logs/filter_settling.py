@@ -37,6 +37,7 @@ def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Rec
     if not kind.has_model:
         return recording, ""
     robot: Any = kind
+    # Required states are those of floating bodies; activations are the outputs of filters.
     if robot.system.required_state_units or not robot.system.activations:
         return recording, ""
     from sims.robot.dynamics.activation_filters import activation_filters, compute_settling_time

@@ -42,6 +42,7 @@ def load_joined(
     Raises:
         InputError: One cannot be read, or they are not of one system with the same channels.
     """
+    # Runs are divided for fitting and validation below, when their total number is known.
     loaded = [
         load_recording(source, system, model, free, divide=False, fix_base=fix_base)
         for source in sources
@@ -54,6 +55,7 @@ def load_joined(
     for recording, other_kind in loaded[1:]:
         _check_joinable(first_recording, kind, recording, other_kind)
     recordings = [recording for recording, _ in loaded]
+    # A fold is one run that is left out in turn, so few runs are cross-validated.
     all_runs = [run for recording in recordings for run in recording.runs]
     is_cross_validated = len(all_runs) <= MAX_FOLDS and not any(run.held_out for run in all_runs)
     if is_cross_validated:

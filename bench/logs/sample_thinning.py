@@ -54,6 +54,7 @@ def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recordi
     )
     if not kind.has_model or rate <= MAX_UNCHANGED_RATE:
         return recording, ""
+    # The largest stride is tried first; None if every stride would lose motion.
     strides = range(round(rate / MIN_THINNED_RATE), 1, -1)
     stride = next((k for k in strides if _preserves_motion(recording, k)), None)
     if stride is None:

@@ -115,9 +115,16 @@ def segment_recording(
 
 
 def _compute_affordable_seconds(kind: type[Simulator]) -> float:
-    """Return the seconds of a robot's motion that cost `MAX_RECORDING_COST`."""
+    """Return the seconds of a robot's motion that cost `MAX_RECORDING_COST`.
+
+    The cost is the number of steps, times the evaluations of a step, times the number of joints
+    plus 3 (1).
+
+    Args:
+        kind: Simulator class of the robot.
+    """
     robot: Any = kind
-    step, integrator, *_ = robot.numerics
+    step, integrator, *_ = robot.numerics  # step in s
     joints = sum(joint.has_one_coordinate for joint in robot.robot.joints)
     return float(
         MAX_RECORDING_COST * step / (joints + 3) / STEP_COST_BY_INTEGRATOR.get(integrator, 1.0)

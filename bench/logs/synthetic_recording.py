@@ -265,7 +265,12 @@ class _RecordingSimulation:
         return SimulatedRecording(recording, truth, self.simulator)
 
     def _build_simulator(self) -> Simulator:
-        """Build the simulator with the specified constants, channels, engine and true effects."""
+        """Build the simulator with the specified constants, channels, engine and true effects.
+
+        Raises:
+            InputError: A constant is unknown or implausible, or the simulator has no effects and
+                engines although some are specified.
+        """
         constants = self.options.constants or {}
         check_known_names("constant", constants, [c.name for c in self.kind.constants])
         values = {n: _check_number("constant", n, value) for n, value in constants.items()}
@@ -301,6 +306,9 @@ class _RecordingSimulation:
         Args:
             number: number of the run from 1; the last ones are held out for validation.
             scenario: times, inputs and initial states of the run.
+
+        Raises:
+            InputError: The simulation diverges.
         """
         # (T, C): the simulator takes a batch of parameter vectors, here of one.
         observed = self.simulator.simulate(np.array([list(self.theta.values())]), scenario)[0]

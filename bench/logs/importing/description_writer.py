@@ -114,6 +114,7 @@ class DescriptionWriter:
         """
         for run, files in self._logs.runs.items():
             if run:
+                # `alone` means that the run is one file, and not all files of a folder.
                 path = files.paths[0] if files.alone else files.folder
                 key = "file" if files.alone else "folder"
                 yield f"[runs.{toml_key(run)}]"
@@ -129,7 +130,7 @@ class DescriptionWriter:
             file: name of the file in the folder of its run.
         """
         runs = self._logs.runs
-        if next(iter(runs.values())).alone:
+        if next(iter(runs.values())).alone:  # each run is one file
             return []
         # A single run without a name has no table that states its folder.
         if "" in runs:

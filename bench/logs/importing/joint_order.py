@@ -312,15 +312,16 @@ def assign_order(
         result: Result to which messages are added.
 
     Returns:
-        For each joint, the joint at whose index its position column is; empty if positions were not
-        exchanged.
+        For each joint, the joint to which its position column had been assigned in the order of the
+        model; empty if positions were not exchanged.
     """
     servos = _collect_servo_signals(logs, signals)
+    # An order is a guess if only the numbers of the columns decided it.
     are_commands_guessed = all(signals.inputs[name].placement.is_order for name in servos.inputs)
     are_positions_guessed = all(
         signals.channels[name].placement.is_order for name in servos.channels
     )
-    if not servos.commands:
+    if not servos.commands:  # orders cannot or need not be compared
         _report_order(signals, [], result)
         return {}
     exchanged = {}
@@ -328,12 +329,14 @@ def assign_order(
         exchanged = _follow_commands(signals, servos, are_commands_guessed)
     is_following = are_followed(servos.commands, servos.positions) or bool(exchanged)
     are_both_guessed = are_commands_guessed and are_positions_guessed
-    # Normalised positions have no known scale, so the model cannot explain them.
+    # Commands and positions agree, but both may be wrong: the model decides. Normalised positions
+    # (-100 to 100 of a joint's range) have no known scale, so the model cannot explain them.
     if are_both_guessed and is_following and not exchanged and not is_normalised:
         preferred = _prefer_model(logs, signals, servos, result)
         if preferred:
             return preferred
     _report_order(signals, servos.joints if is_following else [], result)
+    # If the order of the commands is a guess, these were exchanged, and not the positions.
     return exchanged if are_positions_guessed and not are_commands_guessed else {}
 
 
@@ -385,8 +388,8 @@ def _follow_commands(
         are_commands_guessed: whether the order of the commands is a guess.
 
     Returns:
-        For each joint, the joint at whose index the position is that follows its command; empty if
-        nothing is exchanged.
+        For each joint, the joint to which the position that follows its command had been assigned;
+        empty if nothing is exchanged.
     """
     order = find_order_by_commands(servos.commands, servos.positions)
     if order is None:
@@ -432,7 +435,8 @@ def _prefer_model(
         result: result of the import, to which a message is added.
 
     Returns:
-        For each joint, the joint at whose index its column is; empty if the order is not changed.
+        For each joint, the joint to which its column had been assigned; empty if the order is not
+        changed.
     """
     joints = servos.joints
     actuators = [signals.get_actuator(joint) for joint in joints]
@@ -477,6 +481,8 @@ def _report_order(
             some do not.
         result: Result to which messages are added.
     """
+    # Joints whose signals were assigned by a guess, by the kind of signal: the part of its name
+    # before the dot, such as q for positions and u for commands.
     guessed: dict[str, set[str]] = {"q": set(), "u": set()}
     for table in (signals.channels, signals.inputs):
         for name, signal in table.items():
@@ -488,7 +494,7 @@ def _report_order(
             guessed.setdefault(name.partition(".")[0], set()).add(joint)
     positions, commands = guessed["q"], guessed["u"]
     # A position that follows a named command, and a command that a named position follows, are
-    # certain.
+    # certain. Only a joint with both of them guessed is in doubt.
     if following_joints and not positions & commands:
         return
     names = [joint.name for joint in signals.joints if joint.name in positions | commands]

@@ -61,7 +61,9 @@ def describe_logs(
     assigner = ColumnAssigner(run_logs, signals, options, result)
     assigner.assign_positions()
     assigner.assign_commands()
-    exchanged = assign_order(run_logs, signals, assigner.normalised is not None, result)
+    # Joints whose position columns were exchanged, which velocity columns then follow.
+    is_normalised = assigner.normalised is not None
+    exchanged = assign_order(run_logs, signals, is_normalised, result)
     assign_velocities(run_logs, signals, exchanged, result)
     assigner.assign_efforts()
     assigner.find_switches()

@@ -107,6 +107,7 @@ def _find_runs_in_folder(folder: Path) -> dict[str, RunFiles]:
         else:  # a file, which belongs to the run of its folder
             continue
         if paths:
+            # Some bags are files, whose extension is no part of the name.
             runs[part.stem if part.is_file() else part.name] = RunFiles(part, paths)
     return runs
 
@@ -116,9 +117,11 @@ def _make_run_per_group(run: RunFiles) -> dict[str, RunFiles]:
     if len(run.paths) != 1 or not is_hdf5(run.paths[0]):
         return {}
     groups = list_run_paths(run.paths[0])
-    if groups == run.paths:
+    if groups == run.paths:  # the file itself is the only run
         return {}
-    return {group.name: RunFiles(run.folder, [group], True, run.chosen) for group in groups}
+    return {
+        group.name: RunFiles(run.folder, [group], alone=True, chosen=run.chosen) for group in groups
+    }
 
 
 def _make_run_per_file(run: RunFiles) -> dict[str, RunFiles]:
@@ -144,7 +147,9 @@ def _make_run_per_file(run: RunFiles) -> dict[str, RunFiles]:
             return {}
     if len(set(columns)) > 1:
         return {}
-    return {path.stem: RunFiles(run.folder, [path], True, run.chosen) for path in tables}
+    return {
+        path.stem: RunFiles(run.folder, [path], alone=True, chosen=run.chosen) for path in tables
+    }
 
 
 MAX_RUNS = 8

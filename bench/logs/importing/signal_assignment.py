@@ -165,6 +165,7 @@ class SignalAssignment:
             if joint is not None:
                 assignments.append(PlacedColumn(column, joint, Placement.NAME))
             else:
+                # Without the last number of the name.
                 name_without_number = re.sub(r"\d+(?=\D*$)", "", column.bare)
                 numbered.setdefault((column.file, name_without_number), []).append(column)
         for group_columns in numbered.values():
@@ -266,7 +267,8 @@ def assign_velocities(
     Args:
         logs: Logs that are imported.
         signals: Signals to which velocities are added.
-        exchanged: For each joint, the joint at whose index its position is, if that differs.
+        exchanged: For each joint, the joint to which its position column had been assigned in the
+            order of the model; empty if positions were not exchanged.
         result: Result to which messages are added.
     """
     columns = [c for c in logs.columns if column_guessing.guess_role(c) == "velocity"]
@@ -367,6 +369,7 @@ def _assign_kind(
         signals: assignment to which they are added.
         result: result of the import, to which messages are added.
     """
+    # The comparison with the derivative confirms the unit of a candidate, or gives none.
     confirmed = [candidate for candidate in candidates if candidate.unit]
     units = [candidate.unit for candidate in confirmed]
     usual_unit = max(units, key=units.count) if units else ""
@@ -741,6 +744,7 @@ class ColumnAssigner:
         for column in self._select_by_role("other", "command"):
             if self._is_used(column) or self._result.is_left_out(column):
                 continue
+            # The column has the values of the first run.
             values = np.concatenate([column.values, *self._logs.read_runs(column)[1:]])
             if set(np.unique(values[np.isfinite(values)]).tolist()) == {0.0, 1.0}:
                 self._signals.switches.append(column)

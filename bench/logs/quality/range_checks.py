@@ -154,6 +154,7 @@ def _format_exceeded_range(
             runs.append(run.name)
             min_value, max_value = min(min_value, lowest), max(max_value, highest)
     if runs:
+        # The two parts of a divided run have the same name, which is stated once.
         run_names = ", ".join(dict.fromkeys(runs[:MAX_NAMED_RUNS])) + (
             " ..." if len(runs) > MAX_NAMED_RUNS else ""
         )

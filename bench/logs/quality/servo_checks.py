@@ -65,6 +65,7 @@ def check_servos(recording: Recording, kind: type[Simulator]) -> Iterator[Anomal
         for command, _ in servo_signals
         for _, position in servo_signals
     }
+    # Slopes around 57.3, the number of degrees in a radian.
     min_degree_slope, max_degree_slope = DEGREE_SLOPE_RANGE
     for command, position in servo_signals:
         slope, correlation = regressions[command, position]

@@ -95,6 +95,7 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
                 _count_saturated_samples(run_values, extreme, min_jump) for run_values in values
             )
             total = sum(run_values.size for run_values in values)
+            # If every run may just rest at this value, nothing shows that the signal is cut off.
             if saturated_count > MIN_SATURATED_SHARE * total and not all(
                 _is_resting_value(run_values, extreme) for run_values in values
             ):
