@@ -113,6 +113,7 @@ def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, 
     for leftover in (path, path.with_suffix(".toml")):
         leftover.unlink(missing_ok=True)
     rng = make_rng(*get_stream_prefix(setup.salt), experiment.name, "drop", setup.name)
+    # Height of the ball's lowest point above the ground, m: a number, or a range to draw from.
     height = experiment.initial.get("z", DEFAULT_HEIGHT)
     drop_height = float(rng.uniform(*height)) if isinstance(height, tuple) else height
     radius, sampling = setup.ball.radius, experiment.sampling

@@ -233,6 +233,8 @@ class ShotConfig:
 def read_shot_config(experiment: Experiment) -> ShotConfig:
     """Read and validate the [shot] table of an experiment, with defaults.
 
+    The entry ``rows`` names tuners that see the ball's pixel rows in the film, not its heights.
+
     Raises:
         InputError: an unknown entry, ball or tuner, a value of a wrong type or range, or pixel rows
             without a film.
@@ -266,6 +268,9 @@ def _convert_value(source: str, key: str, value: Any, declared: Any) -> Any:
         key: key of the entry.
         value: its value.
         declared: type of the field.
+
+    Returns:
+        Tuple of names, tuple (low, high), or a number, as declared.
 
     Raises:
         InputError: the value has a wrong type or range.

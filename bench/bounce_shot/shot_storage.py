@@ -35,7 +35,7 @@ def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> 
 
     Lengths are in m. ``off`` is the signed distance along x from the hoop's centre, ``margin`` the
     distance to the rim of the hoop, positive inside it, and ``planned_margin`` the one that the
-    model predicted. Of a traceback only the last line is kept as ``reason``.
+    model predicted. The last line of a traceback, which states the error, becomes the ``reason``.
 
     Args:
         setup: setup of the shot: its ball, drop, incline and hoop.

@@ -73,6 +73,7 @@ class BounceShotStudy(Study):
         experiment = new.experiment
         if read_shot_config(experiment).filmed:
             video_files.check_installed("; or set shot.filmed = 0")
+        # The drop of a ball is recorded by its height z alone.
         if experiment.simulator != "ball" or experiment.observe != ("z",):
             raise InputError(
                 f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
@@ -275,7 +276,12 @@ class _ShotStages:
         calls: list[Call] = [
             (
                 train_or_load,
-                (experiment, TrainingRequest(entry, 0, self._tuned.get(entry.label), self._hidden)),
+                (
+                    experiment,
+                    TrainingRequest(
+                        entry, seed=0, tuned=self._tuned.get(entry.label), hidden=self._hidden
+                    ),
+                ),
             )
             for experiment, entry in zip(experiments, learned_entries, strict=True)
         ]
@@ -315,7 +321,8 @@ class _ShotStages:
         step = self._progress("shooting", len(self._missing_shots))
         for index, error in recording_errors.items():
             status = "no recording" if isinstance(error, InputError) else "crashed"
-            self._store(index, _make_failed_models(self._experiment, error, status), 0.0)
+            failed_models = _make_failed_models(self._experiment, error, status)
+            self._store(index, failed_models, visible_share=0.0)
             step()
         for position, models in workers.iterate_results(calls, self._experiment.timeout):
             index = recorded[position]

@@ -201,14 +201,14 @@ def _tune_model(
         no_runs = ObservedRuns((), np.empty((0, observed_runs.observed.shape[1])))
         target = BlindedTarget(inputs.name, "real", start, observed_runs, no_runs)
         request = RunRequest(
-            label,
-            entry,
-            0,
-            target,
-            entry.budget or experiment.budget,
-            inputs.weights.get(entry.label),
-            inputs.tuned.get(entry.label),
-            inputs.hidden,
+            run=label,
+            entry=entry,
+            seed=0,
+            target=target,
+            budget=entry.budget or experiment.budget,
+            weights=inputs.weights.get(entry.label),
+            tuned=inputs.tuned.get(entry.label),
+            hidden=inputs.hidden,
         )
         outcome = execute_run(experiment, request)
     except InputError as error:
@@ -254,7 +254,7 @@ def _make_observed_runs(recording: Recording, experiment: Experiment) -> Observe
         recording: recording of the ball's drop.
         experiment: content of the experiment's TOML file: simulator, tuners, targets and budget.
     """
-    (run,) = recording.runs
+    (run,) = recording.runs  # one drop
     scenario = make_scenario(run, BallSimulator(observe=["z"]), recording.constants)
     constants = _get_run_constants(recording)
     radius = experiment.fixed["radius"]
@@ -366,7 +366,8 @@ def _plan_shot(
     """Plan a shot in a tuned model, and store the planned drop height and distance to the rim.
 
     A method that crashed has no model and gets no plan. A finished method whose model reaches the
-    hoop from no height gets the status "no plan".
+    hoop from no height gets the status "no plan"; after another end, such as a timeout, the status
+    stays and the planned height is NaN.
 
     Args:
         model: simulator with the parameters that a tuner has found.

@@ -63,7 +63,7 @@ AnswersByCase = dict[str, dict[str, Any]]
 
 
 def read_answers(folder: Path) -> AnswersByCase:
-    """Read all answers of a result folder.
+    """Read all answers of a result folder; there are none without a file of answers.
 
     Returns:
         By case name: ``item``, the case as JSON with its true causes ({} if it could not be drawn),

@@ -296,6 +296,9 @@ def start_diagnoser_process(
         memory: maximum memory, MiB; 0 for no limit.
         hidden: folders that the process must not read.
         extra_modules: further modules that the fork server loads first, such as MuJoCo for robots.
+
+    Returns:
+        The process; the caller ends it.
     """
     child = start_part_process(
         code,

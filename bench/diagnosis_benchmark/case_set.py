@@ -246,6 +246,9 @@ def read_config(experiment: Experiment) -> BenchmarkConfig:
     It states the diagnosers, the tables of cases (``questions``), the random seed and the size of a
     sample.
 
+    Args:
+        experiment: configuration whose table is read.
+
     Raises:
         InputError: a key or value is not allowed; the message names it and what is allowed.
     """
@@ -361,6 +364,9 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
     random subset is selected. Cases that hide the same effect in the same system get the numbers
     0, 1, ... (`index`), from which their seeds follow.
 
+    Args:
+        settings: the ``[diagnosis]`` table: requests of cases, seed, and size of the sample.
+
     Raises:
         InputError: an effect cannot be hidden in a system.
     """
@@ -389,6 +395,9 @@ def _iterate_combinations(
 
     A list that is empty gives None, which means that the value is drawn at random; effects are then
     all that can be hidden.
+
+    Args:
+        request: content of the table: kind of the cases, and lists of values.
 
     Yields:
         Kind, system, effect, size, and recording conditions.

@@ -77,8 +77,12 @@ class DiagnoserReportData:
     def counts(self) -> dict[str, int | str]:
         """Numbers of recordings behind the charts, for their captions.
 
-        ``power_counts`` is a text, as "40 of 1 noises, 40 of 3 noises": number of recordings with a
-        hidden effect of each size.
+        Returns:
+            * ``clean_count``: recordings without a hidden cause,
+            * ``single_count``: recordings with one effect that is large enough to be graded,
+            * ``power_counts``: a text, as "40 of 1 noises, 40 of 3 noises": number of recordings
+              with a hidden effect of each size,
+            * ``calibration_count``: clean recordings with a p-value, of the diagnoser with most.
         """
         table, power, calibration = (
             self.tables[name] for name in ("table", "power", "calibration")
@@ -120,6 +124,8 @@ class DiagnoserReportData:
 
     def make_line_series(self, frame: pd.DataFrame, **where: str) -> tuple[Series, ...]:
         """Make one line with error bars for each diagnoser that occurs in a table.
+
+        A line has the column ``share``; its error bars go from ``low`` to ``high``.
 
         Args:
             frame: the table.
@@ -213,6 +219,9 @@ def _make_board(data: DiagnoserReportData) -> list[Panel]:
     """Make the leaderboard chart: share of named single causes against share of false alarms.
 
     A line marks the largest acceptable share of false alarms.
+
+    Args:
+        data: graded answers and result tables of all diagnosers.
     """
     x_axis = Axis(
         "false alarms if nothing is hidden [%]",
@@ -297,7 +306,11 @@ def _make_sets(data: DiagnoserReportData) -> list[Panel]:
 
 
 def _make_cost(data: DiagnoserReportData) -> list[Panel]:
-    """Make the chart of diagnosed single causes against the cost of an answer."""
+    """Make the chart of named single causes against the cost of an answer: one panel per cost.
+
+    Args:
+        data: graded answers and result tables of all diagnosers.
+    """
     y_axis = Axis("share of single causes named", scales=("linear",), ends=_SHARE_LIMITS)
     labels = {
         "simulations_median": "simulations for an answer, median",

@@ -35,6 +35,9 @@ def count_own_failures(data: DiagnoserReportData) -> dict[str, tuple[int, int]]:
     The report states these numbers, so that the failures of simgap itself are visible. Answers on
     effects smaller than the noise are not graded.
 
+    Args:
+        data: graded answers of all diagnosers.
+
     Returns:
         By kind of case, the number of incorrect graded answers and of all graded answers.
     """
@@ -49,6 +52,9 @@ def find_leader(data: DiagnoserReportData) -> dict[str, Any] | None:
 
     The best one has the highest primary metric. Diagnosers with more than `TARGET_FALSE_ALARM_RATE`
     false alarms cannot lead, because a diagnoser that always alarms finds every cause.
+
+    Args:
+        data: graded answers and result tables of all diagnosers.
 
     Returns:
         * Without clean cases, in which false alarms could be counted: None.

@@ -122,7 +122,10 @@ class DiagnosisStudy(Study):
 
     @cached_property
     def skipped_diagnosers(self) -> dict[str, str]:
-        """Diagnosers that cannot be used here, by name, with the reason."""
+        """Diagnosers that cannot be used here, by name, with the reason.
+
+        A reason is, for example, a package that is not installed.
+        """
         reasons = {}
         # A diagnoser of a plugin is registered only where the plugin was loaded. Reading the folder
         # does not require the plugin, so an unregistered name is no reason to skip.
@@ -269,6 +272,9 @@ class _EvaluationRun:
 
         The list is empty if the sensors cannot show the hidden cause: such a case has an empty
         document.
+
+        Args:
+            question: specification of the case.
         """
         answer = self._answer_store.answered.get(question.name)
         if answer is not None and not answer["item"]:
@@ -289,6 +295,9 @@ class _EvaluationRun:
 
         Returns:
             The diagnosers to evaluate, by name, and the costs of their training.
+
+        Raises:
+            BaseException: a worker failed otherwise than by the diagnoser or the time limit.
         """
         trusted = self._experiment.trusted
         # The model file of a robot is not known before its case, so no diagnoser can train for it.
@@ -382,8 +391,12 @@ def _make_failed_answers(
         labels: labels of the diagnosers.
         error: error of the worker.
 
+    Returns:
+        Document as `evaluate_case` returns it: name of the case (``question``), the case
+        (``item``), of which only the name is known, and one row per diagnoser.
+
     Raises:
-        InputError: the worker failed with this error.
+        InputError: `error` is one: a wrong input stops the study.
     """
     if isinstance(error, InputError):
         raise error

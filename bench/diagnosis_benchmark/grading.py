@@ -70,15 +70,27 @@ class Grade:
 def grade_answer(case: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grade:
     """Grade the verdict of a diagnoser on one benchmark case.
 
-    The grade depends on the named causes; of a correct answer, the 95 % intervals of its numbers
-    are compared with the true values, too.
+    An answer names causes; each is a set of effects that the data cannot distinguish, a leading
+    effect and its alternatives. The grade depends on these sets; of a correct answer, the 95 %
+    intervals of its numbers are compared with the true values, too.
 
     Args:
-        case: the case with its true causes.
+        case: the case with its true causes. Its kind is clean (no cause), single, double, or
+            foreign (an unmodelled cause, which the library does not contain).
         verdict: the answer as a dictionary; None for a missing answer.
+
+    Returns:
+        * ``outcome``: right (every cause is named alone), set (in a set with alternatives), class
+          (an equivalent effect is named), one (of two), extra (another one in addition), wrong,
+          unnamed, missed, alarm, undecided, or failed (no answer),
+        * ``set_size``: number of effects in the largest set that contains a true cause; 0 without,
+        * ``class_size``: the same with equivalent effects counted as one,
+        * ``named``: the named causes as text, such as ``drag.linear|wind + force.bias``,
+        * ``covered``: by coefficient or parameter, whether its interval contains the true value.
     """
     if verdict is None:
         return Grade("failed", set_size=0, class_size=0, named="", covered={})
+    # One tuple of names for each cause: the leading effect, then its alternatives.
     sets = list_named_sets(verdict)
     outcome, set_size, class_size = grade_sets(
         case.kind, case.effects, verdict, lambda effect: find_equivalent_effects(case, effect)
@@ -212,6 +224,10 @@ def _count_classes(names: Sequence[str], equivalents: EquivalentEffects) -> int:
 
     A name ``effect@*`` means the effect at any joint. It is not counted if the set also contains
     the effect at one joint, as ``effect@elbow``.
+
+    Args:
+        names: names of the effects in the set.
+        equivalents: returns an effect and all effects that are equivalent to it in any data.
     """
     effects_at_joints = {name.partition("@")[0] for name in names if not name.endswith("@*")}
     counted_names = [

@@ -42,10 +42,9 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
     problem = TuningProblem(experiment, salt)
     calibration = experiment.calibration or CalibrationConfig()
     streams = TargetStreams(salt, experiment.name, "calibration", 0)
-    training_box = problem.cube.training
-    point = streams.get_stream("truth").uniform(
-        training_box[0], training_box[1], size=problem.cube.dim
-    )
+    # Training ranges in the unit cube, in which every parameter's bounds are 0 and 1.
+    low, high = problem.cube.training
+    point = streams.get_stream("truth").uniform(low, high, size=problem.cube.dim)
     # The true system (`world`) has the first of the tuned parameters.
     theta = problem.cube.to_physical(point[None])[:, : len(problem.world.parameters)]
     initial = {**experiment.initial, **calibration.initial}
@@ -56,7 +55,7 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
         scene = targets.draw_scenario(
             experiment, streams.get_held_out_stream(run_index), initial, inputs
         )
-        noise_free = problem.world.simulate(theta, scene)[0]
+        noise_free = problem.world.simulate(theta, scene)[0]  # (T, C); theta has one row
         # Each run has its own stream of sensor noise.
         rng = TargetStreams(salt, experiment.name, "calibration", 1 + run_index).get_stream("noise")
         measured = noise_free + problem.noise * rng.standard_normal(noise_free.shape)

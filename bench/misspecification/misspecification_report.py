@@ -348,6 +348,10 @@ def _build_error_table(scores: StudyScores, lines: pd.DataFrame) -> pd.DataFrame
     Args:
         scores: scores of a misspecification study: the runs of both simulators.
         lines: score table of this study, or of several.
+
+    Returns:
+        One row per tuner and one column per metric and simulator, sorted by the last column: the
+        prediction error in the extended simulator.
     """
     heads = {PARAMETERS: "parameters", PREDICTION: f"unseen {scores.channel}"}
     lines = lines[(lines["experiment"] == scores.experiment.name) & lines["metric"].isin(heads)]

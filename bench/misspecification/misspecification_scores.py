@@ -218,6 +218,7 @@ def build_score_table(scores: StudyScores) -> pd.DataFrame:
     """
     lines = []
     for (model, tuner), group_errors in scores.errors.groupby(["model", "tuner"], sort=False):
+        # Metric, parameter, unit, and column of the errors.
         metrics = [
             (metric, p.name, TRAINING_WIDTHS_UNIT, column)
             for p in scores.parameters
@@ -272,7 +273,9 @@ def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
     """Build the table of rank agreement between simulators; columns as `RANK_AGREEMENT_COLUMNS`.
 
     The agreement is Kendall's tau between the mean ranks of the tuners, with an interval and the
-    p-value that the ranking does not change. Friedman's p-values tell whether tuners differ at all.
+    p-value of the hypothesis that the ranking does not change. ``tau_of_halves`` is the mean tau
+    between random halves of the targets in the original simulator: two rankings that differ in
+    their targets only reach this value. Friedman's p-values tell whether tuners differ at all.
 
     Args:
         scores: scores of a misspecification study: the runs of both simulators.
@@ -348,8 +351,13 @@ def compute_joint_ranks(ranked: pd.DataFrame, metric: str) -> JointRanks:
     Nemenyi's test of each pair.
 
     Args:
-        ranked: rows of `build_rank_table` of several systems.
+        ranked: rows of `build_rank_table` of several systems: mean rank of each tuner in both
+            simulators, by experiment and metric.
         metric: name of the metric.
+
+    Returns:
+        Ranks by system and tuner in each simulator (the original and the extended one), Kendall's
+        tau between both, p-values of Friedman's test, and numbers of pairs that differ.
     """
     part = ranked[ranked["metric"] == metric]
     tables, friedman, significant_pairs = {}, {}, {}

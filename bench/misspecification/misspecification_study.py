@@ -83,6 +83,9 @@ class MisspecificationStudy(Study):
             jobs: number of worker processes.
             progress: makes progress callbacks; None for no progress output.
             pool: worker pool; None to create one.
+
+        Returns:
+            How many runs of both comparisons are finished and planned, and why it ended early.
         """
         from bench.benchmark.runner.experiment_runner import no_progress
 
@@ -90,6 +93,7 @@ class MisspecificationStudy(Study):
             self._extend(jobs, progress or no_progress)
         except KeyboardInterrupt:
             count_per_model = self._count_planned_runs()
+            # Neither of the two comparisons has begun.
             return StudyOutcome(0, 2 * count_per_model, interrupted=True)
         finished_count = planned_count = 0
         for model in MODEL_LABELS:
@@ -160,7 +164,8 @@ class MisspecificationStudy(Study):
         if (folder / CONFIGURATION_FILE).is_file():
             comparison = Comparison.resume(folder, self.plugins)
         else:
-            # A public salt is already part of the experiment.
+            # A public salt is already part of the experiment. The hash of a secret salt is removed
+            # from the plan, because `prepare_study` enters it again.
             secret = read_salt(self.folder, experiment)
             plan = replace(self.get_experiment(model), salt_sha256="")
             from bench.benchmark.runner.study_base import prepare_study
@@ -267,6 +272,9 @@ def _make_comparison_experiment(
     experiment: Experiment, model: str, settings: Mapping[str, Any]
 ) -> Experiment:
     """Make the experiment of one of the two comparisons: the same targets in another simulator.
+
+    Targets are drawn from the name of an experiment, so `same_targets_as` states that of the study.
+    The calibration recording belongs to the study, not to its comparisons.
 
     Args:
         experiment: the experiment of the study.

@@ -304,7 +304,16 @@ def _compute_unexplained_size(
 
 
 def record_case(case: BenchmarkCase) -> RecordedCase:
-    """Simulate the recording of a case, with sensor noise."""
+    """Simulate the recording of a case, with sensor noise.
+
+    A case is a recipe without data: its name determines the runs and all random numbers.
+
+    Args:
+        case: the case with its true causes, which the recording does not state.
+
+    Returns:
+        The recording, with the noise only if the case states it, and the system for the units.
+    """
     setting = restore_conditions(case)
     # Only some recordings state the noise, as those of users.
     noise = setting.noise.sigma if case.stated else {}
@@ -321,6 +330,9 @@ def _simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[R
     Args:
         case: the case; it states the simulator of the recording (`source`).
         setting: its recording conditions, with all runs.
+
+    Returns:
+        The runs, named by their indices, with noisy channels and the inputs.
     """
     rng = make_case_rng(case.name, "noise")
     first_held_out = case.runs - count_held_out_runs(case)

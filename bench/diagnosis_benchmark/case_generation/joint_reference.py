@@ -235,6 +235,9 @@ class ReferenceLoad(ABC):
             v: velocity of the drive side.
             y: position of the load.
             w: velocity of the load.
+
+        Returns:
+            y' and w'.
         """
         return w, self.compute_load_acceleration(x, v, y, w) + self.weight(y) / self.total_inertia
 
@@ -373,6 +376,9 @@ class DahlReferenceFriction:
             x: position.
             v: velocity.
             strain: friction force as a fraction of its limit.
+
+        Returns:
+            0 for the unused state, and strain'.
         """
         # At most 400 1/s, as in the library: far above visible rates, but it can be integrated.
         speed = min(abs(v) / self.deflection, 400.0)
@@ -569,6 +575,9 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
 
     Returns:
         End time, state at that time, and the dense solution (None without motion).
+
+    Raises:
+        RuntimeError: the solver failed.
     """
     (x, v, *z), end = state, joint.segment.end
     direction = copysign(1.0, v) if v else 0.0

@@ -483,6 +483,8 @@ def name_case(
 ) -> str:
     """Compose the name of a case or of its specification, such as ``single-ball-wind-3``.
 
+    Parts that are empty, or None because they are drawn, are left out.
+
     Args:
         kind: one of `CASE_KINDS`.
         system: name of the system.

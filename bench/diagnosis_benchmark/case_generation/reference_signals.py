@@ -170,8 +170,8 @@ def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Arr
     at most `SLEW_STEP` seconds, each with its mean value.
 
     Args:
-        levels: (N,) levels of the input.
-        edges: (N,) times at which they begin, s.
+        levels: N levels of the input, (N,).
+        edges: times at which they begin, s, (N,).
         max_rate: largest change per second, in the unit of the input.
 
     Returns:

@@ -200,7 +200,7 @@ def _apply_lag(values: Array, grid: Array, lag: float) -> Array:
     The solution is exact for readings x that are linear between grid points.
 
     Args:
-        values: readings x without lag at the grid points, (G, C).
+        values: readings x of C channels without lag at G grid points, (G, C).
         grid: times, s, (G,).
         lag: time constant, s.
 

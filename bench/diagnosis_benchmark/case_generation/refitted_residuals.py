@@ -160,12 +160,14 @@ class NuisanceFitter:
             damping: damping factor of the diagonal.
 
         Returns:
-            Step in units of the scales, (P,).
+            Step to be added to the unknowns, in units of the scales, (P,); not finite if the
+            residual is not.
         """
         normal_matrix = slope.T @ slope
         diagonal = np.diag(normal_matrix)
         normal_matrix = normal_matrix + np.diag(damping * diagonal + RIDGE * diagonal.max())
-        with np.errstate(invalid="ignore"):  # a simulation that diverges has an infinite residual
+        # The residual is infinite if the simulation diverges.
+        with np.errstate(invalid="ignore"):
             gradient = slope.T @ residual
         return np.asarray(np.linalg.solve(normal_matrix, gradient), dtype=np.float64)
 
@@ -216,13 +218,18 @@ class NuisanceFitter:
 
 
 def simulate_observations(setting: RecordingConditions, effects: EffectCoefficients) -> Array:
-    """Simulate noise-free observations (R, T, C) with given effects.
+    """Simulate noise-free observations (R, T, C) with given effects by the batch engine.
 
     Shapes: R runs, T samples, C channels.
+
+    Args:
+        setting: recording conditions with the true base parameters and the runs.
+        effects: coefficients of the effects by name; empty for none.
     """
     kind = SIMULATORS[setting.system]
     fixed_effects = {name: list(c) for name, c in effects.items()}
     simulator = kind(setting.constants, setting.channels, engine="batch", fixed=fixed_effects)
+    # One row of base parameters for each run.
     theta = np.array(
         [[setting.parameters[p.name] for p in kind.system.parameters]] * len(setting.scenarios)
     )
@@ -255,6 +262,9 @@ def make_gap_function(
         `observed` gives the recording with the cause at a strength, and `fit` refits the model
         without it, from the true parameters and initial states or, if there was a call before, from
         values extrapolated from its fit, which saves iterations.
+
+        Args:
+            strength: factor of the coefficients of the cause.
         """
         theta, starts = fit.theta, fit.starts
         # The fitted values differ from the true ones about in proportion to the strength.
@@ -392,9 +402,7 @@ def _rank_starts(
 def _iterate_stop_starts(
     setting: RecordingConditions, path: Array
 ) -> Iterator[tuple[float, float, float]]:
-    """Yield starting values of an end stop: stiffness, position and loss.
-
-    The sign of the stiffness is the side of the stop; the loss is its damping in s/m or s/rad.
+    """Yield starting values from which an end stop is fitted.
 
     There are soft and hard stops at either end of the travel, which the motion meets late and
     early. A grid is used because a stop that the motion does not reach has no derivative.
@@ -402,6 +410,10 @@ def _iterate_stop_starts(
     Args:
         setting: recording conditions.
         path: positions, of any shape; only the smallest and the largest are used.
+
+    Yields:
+        Stiffness, whose sign is the side of the stop, position, and loss: the damping as a factor
+        of the approach velocity, s/m or s/rad.
     """
     low, high = float(path.min()), float(path.max())
     # Scale of the stiffness, N m/rad for a pendulum and N/m for a slider.
@@ -438,8 +450,8 @@ def _estimate_linear_step(
     """Estimate the residual by one least-squares step from a zero effect with a fixed shape.
 
     theta consists of the base parameters, the linear coefficients of the effect (zero at first) and
-    its shape parameters, which the step does not change. Shape parameters that the system does not
-    have are omitted, as the second component of the wind for a slider.
+    its shape parameters (such as a period), which the step does not change. Shape parameters that
+    the system does not have are omitted, as the second component of the wind for a slider.
 
     Shapes: R runs, T samples, C channels.
 

@@ -54,6 +54,10 @@ def arrange_slopes(slopes: Array, shared_count: int) -> Array:
             as parameters, come first, those of the run's own unknowns, such as initial states,
             last.
         shared_count: number of shared unknowns, P.
+
+    Returns:
+        Jacobian with the samples of all runs in rows. The P shared unknowns are the first columns;
+        S columns of each run follow, which are zero in the rows of the other runs.
     """
     columns = slopes.swapaxes(1, 2)  # (R, N, P + S)
     # The own unknowns of a run do not change the other runs.

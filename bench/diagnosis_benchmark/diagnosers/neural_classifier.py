@@ -92,6 +92,7 @@ class NeuralClassifier(Diagnoser):
             name = (
                 "" if task.rng.random() < CLEAN_EXAMPLE_SHARE else str(task.rng.choice(classes[1:]))
             )
+            # An image is the input of the network: resampled signals of all runs.
             try:
                 image = _simulate_example(task, name, number)
             except SimulationBudgetExceededError:
@@ -208,12 +209,18 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
 def _draw_coefficients(training_task: DiagnoserTrainingTask, name: str) -> tuple[float, ...]:
     """Draw coefficients of an effect for a training example.
 
-    The first coefficient, the size, is drawn log-uniformly down to 0.3 % of its maximum; the others
-    uniformly. Coefficients that must be positive, such as a period, are always drawn log-uniformly.
+    The magnitude of the first coefficient, the size, is drawn log-uniformly from 0.3 to 100 % of
+    its upper bound, that of the others uniformly from 10 to 100 %. The sign is random if the lower
+    bound is negative. The negative values of asymmetric bounds, such as those of a delay, may lie
+    below the lower bound. Coefficients with a positive lower bound, such as a period, are drawn
+    log-uniformly between their bounds.
 
     Args:
         training_task: simulator, library and random numbers of the training.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+
+    Returns:
+        Coefficients in the order of the effect.
     """
     rng = training_task.rng
     values = []
@@ -383,11 +390,10 @@ def _train_network(
 
     The loss is the cross entropy. The first `VALIDATION_SHARE` of the examples are not trained on.
 
-    Shapes: R runs.
-
     Args:
-        images: inputs, one (R, F, GRID_POINT_COUNT) per example.
-        labels: index of the class of each example, (B,).
+        images: inputs of E examples, each (R, F, GRID_POINT_COUNT) with R runs and F rows of
+            resampled signals.
+        labels: index of the class of each example, (E,).
         classes: number of classes.
         seed: seed of initial weights, order of the examples and dropout.
 
@@ -436,12 +442,11 @@ def _predict_probabilities(
 ) -> Array:
     """Compute the class probabilities of one recording, (classes,).
 
-    Shapes: R runs.
-
     Args:
         trained_arrays: trained weights by the name of the layer.
-        image: input of the network, (R, F, GRID_POINT_COUNT).
-        classes: number of classes.
+        image: input of the network, (R, F, GRID_POINT_COUNT), with R runs and F rows of resampled
+            signals.
+        classes: number of classes: no effect, and each effect of the library.
     """
     import torch
 
