@@ -66,6 +66,10 @@ def _iterate_rows(diagnoser: str, answers: AnswersByCase) -> Iterator[dict[str, 
 
     A case is left out if it was not drawn (its stored document has no hidden effects) or if this
     diagnoser has not answered it.
+
+    Args:
+        diagnoser: name of the diagnoser.
+        answers: by name of the case, its document (``item``) and the stored answers (``rows``).
     """
     for question, answer in sorted(answers.items()):
         # The case could not be drawn, or its worker was lost before it was drawn.
@@ -254,6 +258,9 @@ def _list_metrics(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
 def _list_groups(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of groups.csv for one diagnoser: metrics by system, noise, rate and so on.
 
+    Args:
+        diagnoser_rows: graded answers of one diagnoser, one row per case.
+
     Yields:
         Metric, column that defines the groups (``by``), its value in this group, and the fraction.
     """
@@ -279,6 +286,9 @@ def _list_calibration(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
 
     A diagnoser without p-values has no lines. For a calibrated p-value this fraction equals the
     level.
+
+    Args:
+        diagnoser_rows: graded answers of one diagnoser, one row per case.
     """
     p_values = pd.to_numeric(select_clean(diagnoser_rows)["p_value"]).dropna()
     for level in P_VALUE_LEVELS if len(p_values) else ():
@@ -288,8 +298,11 @@ def _list_calibration(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
 def _list_set_sizes(diagnoser_rows: pd.DataFrame) -> Iterator[TableRow]:
     """Yield the lines of sets.csv: answers about single effects by the size of their largest set.
 
-    The fraction is that of the answers whose sets contain the true cause. Large sets contain it
-    more easily but tell less.
+    A set contains the effects that an answer cannot distinguish. The fraction is that of the
+    answers whose sets contain the true cause. Large sets contain it more easily but tell less.
+
+    Args:
+        diagnoser_rows: graded answers of one diagnoser, one row per case.
     """
     single_rows = select_single_effects(diagnoser_rows)
     for label, (low, high) in SET_SIZE_BINS.items():
@@ -444,10 +457,13 @@ def build_all_tables(
 ) -> dict[str, pd.DataFrame]:
     """Build every table, by the name of its file.
 
+    Most tables have lines for each diagnoser; two compare diagnosers or causes and are built from
+    all rows.
+
     Args:
         rows: one row per answer.
         order: names of the diagnosers.
-        training: rows of training.csv.
+        training: rows of training.csv, one per diagnoser and system.
     """
     lines: dict[str, list[TableRow]] = {name: [] for name in _LINES_OF_TABLES}
     for name in order:
@@ -502,8 +518,11 @@ def is_correct(rows: pd.DataFrame) -> pd.Series[bool]:
     """Return whether each answer is correct.
 
     Correct is: no alarm for a clean recording; for hidden effects, all named alone or in sets of at
-    most two, equivalent effects counted once; for an unmodelled cause, the statement that no effect
-    of the library explains it.
+    most two, equivalent effects counted once; for an unmodelled cause (kind "foreign"), the
+    statement that no effect of the library explains it. A missing answer is not correct.
+
+    Args:
+        rows: rows of items.csv, one per answer.
     """
     # True if all hidden effects are named, equivalent effects counted once.
     is_right = rows["found_class"].astype(bool)

@@ -192,7 +192,8 @@ def _smooth_radius(track: BallTrack) -> Array:
         # A frame whose outline is far off, as at an impact, gets a small weight.
         typical_deviation = max(float(np.median(deviations)), 1e-9)
         line = np.polyfit(positions, radii, 1, w=1 / (1 + (deviations / typical_deviation) ** 2))
-    # The line may cross zero outside the frames that show the ball; a radius may not.
+    # The line may cross zero outside the frames that show the ball; a radius may not. So it is at
+    # least 0.3 of its median.
     result: Array = np.maximum(np.polyval(line, fall_position), 0.3 * float(np.median(radii)))
     return result
 
@@ -206,6 +207,9 @@ def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
     Args:
         times: (T,) times of the frames, s.
         q: (T,) position downwards, in ball radii or metres; NaN where the ball was not detected.
+
+    Returns:
+        The flights in order: parabola q(t), times of the first and last frame, and weight.
     """
     visible_frames = np.flatnonzero(np.isfinite(q))
     last_index = len(visible_frames) - 1

@@ -183,6 +183,9 @@ def _convert_to_heights(
         diameter: diameter of the ball in metres, if it is known.
         scale: "camera", "diameter" or "fall"; None for the best one available.
 
+    Returns:
+        Height of the ball in each frame, its radius, and how they were found.
+
     Raises:
         InputError: the film does not show what the scale needs, or the scale "diameter" is
             requested without a diameter.

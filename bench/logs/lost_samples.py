@@ -67,6 +67,9 @@ def fill_lost_commands(recording: Recording) -> tuple[Recording, str]:
     Runs without inputs, or with uneven sampling intervals, and gaps of more than
     `MAX_FILLED_SAMPLES` samples stay as they are.
 
+    Args:
+        recording: Recording as it was read.
+
     Returns:
         The recording, and a message for the user, which is empty if nothing was lost.
     """

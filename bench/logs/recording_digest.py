@@ -55,6 +55,12 @@ def compute_content_digest(path: Path) -> bytes:
     * any other file
 
     Missing files contribute nothing; reading them later reports the error.
+
+    Args:
+        path: path of the file, perhaps with an episode, a topic or a group behind it.
+
+    Returns:
+        SHA-256 in binary form.
     """
     episode = split_episode_path(path)
     if episode is not None:
@@ -62,6 +68,7 @@ def compute_content_digest(path: Path) -> bytes:
             return b"".join(compute_content_digest(file) for file in list_episode_files(*episode))
         except InputError:
             return b""
+    # A bag or HDF5 file, and the topic or group in it; None for any other file.
     container = split_bag_path(path) or split_group_path(path)
     root = path if container is None else container[0]
     if root.suffix.lower() == ".xml":
@@ -82,6 +89,9 @@ def _list_included_files(model: Path) -> list[Path]:
     """Return a model file and the files that it includes, directly or through others.
 
     As in MJCF, all names are relative to the folder of the model file.
+
+    Args:
+        model: path of the model file.
     """
     files = [model]
     # Files that are appended here are visited later in this loop.

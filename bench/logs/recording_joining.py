@@ -162,6 +162,9 @@ def make_log_names(paths: Sequence[Path]) -> list[str]:
 
     It is the stem of its path; with its folder if stems repeat, and with its number if these
     repeat, too.
+
+    Args:
+        paths: paths of the logs.
     """
     stems = [path.stem for path in paths]
     if len(set(stems)) == len(stems):

@@ -122,6 +122,9 @@ def _find_system(path: str | Path, name: str) -> type[Simulator]:
 def check_value_sizes(recording: Recording) -> None:
     """Reject values that are so large that sums of their squares may overflow.
 
+    Args:
+        recording: Recording to check; missing values (NaN) are ignored.
+
     Raises:
         InputError: A value of a channel or input exceeds `MAX_NUMBER`; the message is one line.
     """
@@ -159,6 +162,9 @@ class FrameDescription:
 
     def refuse_for_files(self, recording: object) -> None:
         """Reject a description of a data frame if the recording is a file, which has its own.
+
+        Args:
+            recording: path of the file, for the message.
 
         Raises:
             InputError: units, constants or a description are given.

@@ -320,6 +320,9 @@ def format_robot_summary(kind: type[Simulator]) -> Iterator[str]:
     """Yield lines about the robot of a simulator: its file, its parts and notes on repairs.
 
     Nothing is yielded for a simulator of another system.
+
+    Args:
+        kind: simulator class; `has_model` means that it simulates a robot from its model file.
     """
     if not kind.has_model:
         return

@@ -146,6 +146,9 @@ def _cut_run(run: Run, seconds: float, max_length: float) -> list[Run]:
         run: run to cut.
         seconds: total duration of the segments.
         max_length: longest duration of a segment, s.
+
+    Returns:
+        The segments in order, each a run that is named after its begin.
     """
     length = min(max_length, seconds)
     # A segment needs a few samples, even if only little of a run may be kept.

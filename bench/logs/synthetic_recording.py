@@ -191,6 +191,9 @@ class _RecordingSimulation:
         (`defaults`). `theta` has the true parameters by name, `effects` the true coefficients by
         effect, and `ranges` the interval from which each initial state is drawn.
 
+        Args:
+            options: Specification of the recording.
+
         Raises:
             InputError: The specification names something unknown or has implausible numbers.
         """
@@ -286,6 +289,9 @@ class _RecordingSimulation:
 
         An initial state is drawn from its interval; equal ends fix it. Each random draw has its own
         stream, so that no draw depends on any other.
+
+        Args:
+            number: number of the run from 1.
         """
         initial = {
             name: low if low == high else self._make_rng("initial", name, number).uniform(low, high)
@@ -333,6 +339,9 @@ class _RecordingSimulation:
 def _get_simulator_class(options: SimulationSpec) -> type[Simulator]:
     """Return the simulator class that a specification names, by its system or its robot model file.
 
+    Args:
+        options: Specification of the recording.
+
     Raises:
         InputError: It names both or neither.
     """
@@ -352,6 +361,9 @@ def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
     For an extended simulator, which has another name than its system, the default channels are left
     out, because it records the channels of the recording that it was fitted to. A simulator without
     a system has no defaults.
+
+    Args:
+        kind: Simulator class.
     """
     if not issubclass(kind, SystemSimulator):
         return DefaultRecording()
@@ -362,7 +374,14 @@ def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
 
 
 def _count_held_out_runs(options: SimulationSpec) -> int:
-    """Return how many runs, the last ones, are held out for validation; by default a third."""
+    """Return how many runs, the last ones, are held out for validation; by default a third.
+
+    Args:
+        options: Specification of the recording.
+
+    Raises:
+        InputError: There is no run, or as many runs are held out as there are.
+    """
     if options.runs < 1:
         raise InputError(f"runs = {options.runs}: expected at least 1")
     if options.held_out is None:
@@ -377,6 +396,9 @@ def _count_held_out_runs(options: SimulationSpec) -> int:
 
 def _count_samples(options: SimulationSpec) -> int:
     """Return the number of samples of a run: duration (s) times rate (Hz), rounded.
+
+    Args:
+        options: Specification of the recording.
 
     Raises:
         InputError: The number is below 2 or too large, the run too short, or the rate too high.
@@ -528,7 +550,10 @@ def _check_interval(name: str, stated_range: float | tuple[float, float]) -> tup
 def _check_number(label: str, name: str, value: object) -> float:
     """Return a value of the specification as a float if it is a plausible number.
 
-    `label` and `name` identify the value in the message of the error.
+    Args:
+        label: Kind of the value in the message of an error, such as "parameter".
+        name: Name of the value in that message.
+        value: The value.
 
     Raises:
         InputError: The value is not a number, or not a plausible one.

@@ -79,12 +79,15 @@ class _ForwardSelection(Diagnoser):
         The search stops if the model is sufficient, if no effect improves it, or at `MAX_EFFECTS`
         effects.
 
-        In each round, `candidates` are the models with one more effect, ordered by the criterion.
-        The best becomes the new model; candidates within the tolerance `near` of it are its
-        alternatives.
+        In each round, `candidates` are the models with one more effect, ordered by the criterion,
+        the lowest first. The best becomes the new model; candidates within the tolerance `near` of
+        it are its alternatives.
 
         Args:
             evidence: fitted base model and directions of the effects.
+
+        Returns:
+            Verdict on the selected effects, each with its alternatives.
         """
         samples = int(evidence.observed_mask.sum())
         best = _measure_fit(evidence, evidence.base.fit)
@@ -318,8 +321,11 @@ def _choose_starts(
         current_fit: the current model.
         column: the effect and its best directions, one per coefficient on which the change of the
             residual depends linearly.
-        residual: residual after parameters and initial states are projected out, (N,).
-        effects: columns of all directions after this projection, (N, K).
+        residual: residual of N samples after parameters and initial states are projected out, (N,).
+        effects: columns of all K directions after this projection, (N, K).
+
+    Returns:
+        One or two starts: effects, parameters with coefficients, and initial states.
     """
     evaluator, name = evidence.evaluator, column.effect
     # A probe has the coefficients with which a direction was simulated, and the index of the one

@@ -82,6 +82,9 @@ class NeuralClassifier(Diagnoser):
 
         Class 0 is "no effect", the others are the effects of the library in alphabetical order.
 
+        Args:
+            task: simulator, library, budget of simulations and random numbers of the training.
+
         Returns:
             Weights of the network; empty if there are too few examples.
         """
@@ -114,8 +117,12 @@ class NeuralClassifier(Diagnoser):
         The network was trained with all effects of the system; those that the recorded signals
         cannot show get the probability zero. The answer is "adequate" unless "no effect" is less
         probable than `CLEAN_PROBABILITY_THRESHOLD`. Effects at least
-        `ALTERNATIVE_PROBABILITY_RATIO` as probable as the best are its alternatives. Without
-        trained weights the answer is "unidentifiable".
+        `ALTERNATIVE_PROBABILITY_RATIO` as probable as the best are its alternatives; if all of them
+        together are improbable, the answer is "unknown". Without trained weights it is
+        "unidentifiable".
+
+        Args:
+            case: recording, simulator, effects, and the trained weights (`learned`).
         """
         if not case.learned:
             return Answer("unidentifiable")

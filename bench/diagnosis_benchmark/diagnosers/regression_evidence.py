@@ -181,8 +181,8 @@ class RegressionEvidence:
     def effect_columns(self) -> list[EffectColumn]:
         """Columns of all effects, one for each point of their parameter grids.
 
-        A nonlinear parameter, such as a period, has a grid of values; the directions at one value
-        form one column.
+        A nonlinear parameter, such as a period, has a grid of values; the directions at one value,
+        one for each linear coefficient, form one column.
         """
         # Indices of directions by effect, grid point and, for a direction of a fixed size, index.
         groups: dict[tuple[str, int, int], list[int]] = {}
@@ -351,7 +351,7 @@ class RegressionEvidence:
 
                     Args:
                         deriv: order of the derivative; 0 for the smoothed values.
-                        channel_values: trajectories of the channel, (T, K).
+                        channel_values: K trajectories of the channel, (T, K).
                         window: number of samples of the window.
                         step: sampling interval, s.
                     """
@@ -494,8 +494,8 @@ def compute_block_means(values: Array, count: int) -> Array:
     """Compute the means of consecutive blocks (count,), as neighbouring samples are correlated.
 
     Args:
-        values: values of the samples, (N,).
-        count: number of blocks.
+        values: values of N samples, (N,).
+        count: number of blocks, which differ by at most one sample in length.
     """
     edges = np.linspace(0, len(values), count + 1).astype(int)
     return np.array([values[start:end].mean() for start, end in pairwise(edges.tolist())])

@@ -59,8 +59,12 @@ class _SparseRegression(Diagnoser):
         """Name the terms that predict the accelerations of the held-out runs.
 
         The regression is repeated with windows of several lengths, and the one whose prediction is
-        most significant gives the answer. More than `MAX_TERMS` terms mean that no small model
-        exists: "unknown".
+        most significant gives the answer. No term means "adequate", more than `MAX_TERMS` terms
+        mean that no small model exists: "unknown". With too few samples for any window the answer
+        is "unidentifiable".
+
+        Args:
+            case: recording, simulator and effects, without the hidden causes.
         """
         with closing(RegressionEvidence.collect(case)) as evidence:
             results = [
@@ -148,8 +152,8 @@ class _SparseRegression(Diagnoser):
         """Yield the coefficients (K,) of models with different numbers of terms.
 
         Args:
-            library: columns of the candidate terms with unit mean square, (N, K).
-            residual: residual, (N,).
+            library: columns of K candidate terms with unit mean square, (N, K).
+            residual: residual of N samples, (N,).
         """
 
 
@@ -166,8 +170,8 @@ class SequentialThresholdedLeastSquares(_SparseRegression):
         smaller threshold keeps more terms.
 
         Args:
-            library: columns of the candidate terms with unit mean square, (N, K).
-            residual: residual, (N,).
+            library: columns of K candidate terms with unit mean square, (N, K).
+            residual: residual of N samples, (N,).
         """
         from pysindy import optimizers
 
@@ -192,11 +196,12 @@ class ForwardOrthogonalLeastSquares(_SparseRegression):
         number for which it succeeds is used.
 
         Args:
-            library: columns of the candidate terms with unit mean square, (N, K).
-            residual: residual, (N,).
+            library: columns of K candidate terms with unit mean square, (N, K).
+            residual: residual of N samples, (N,).
         """
         from pysindy import optimizers
 
+        # More terms than `MAX_TERMS` are allowed, because they show that no small model exists.
         for max_terms in range(min(2 * MAX_TERMS, library.shape[1]), 0, -1):
             model = optimizers.FROLS(max_iter=max_terms, alpha=RIDGE_PENALTY * len(residual))
             # FROLS raises an error if all other terms depend linearly on the selected ones.
@@ -215,10 +220,10 @@ def _drop_duplicate_columns(
 
     Args:
         terms: name of the effect and index of its column, for each term.
-        effects: columns of all directions, (N, K).
+        effects: columns of all K directions with N rows, (N, K).
 
     Returns:
-        The terms, and their columns.
+        The selected terms in their order, and their columns, (N, number of selected terms).
     """
     kept_terms: list[tuple[str, int]] = []
     columns: list[Array] = []
@@ -247,13 +252,13 @@ def _select_by_one_standard_error(
     held-out runs; their scatter gives the standard error.
 
     Args:
-        models: coefficients of each model, (K,).
-        residual: residual of the held-out runs, (N,).
+        models: coefficients of each model for K terms, (K,).
+        residual: residual of N samples of the held-out runs, (N,).
         library: columns of the terms in the held-out runs, (N, K).
 
     Returns:
-        Its coefficients (zero if no model is significantly better than none), and the improvement
-        of the best model over no terms in standard errors.
+        Coefficients of the selected model (zero if no model is significantly better than none),
+        and the improvement of the best model over no terms in standard errors.
     """
     zero_model = np.zeros(library.shape[1])
     candidates = [zero_model, *models]
@@ -270,9 +275,10 @@ def _select_by_one_standard_error(
         return zero_model, sigmas
     allowed_models = []
     for coefficients, error in zip(models, errors[1:], strict=True):
-        excess = error - errors[best]
+        excess = error - errors[best]  # by block
         if excess.mean() <= compute_standard_error(excess):
             allowed_models.append(coefficients)
+    # The simplest model has the fewest terms, which are the coefficients that are not zero.
     return min(allowed_models or [candidates[best]], key=np.count_nonzero), sigmas
 
 
@@ -288,7 +294,7 @@ def _find_equivalent_effects(
         name: the selected effect.
         selected_effects: all selected effects.
         columns: one column for each effect.
-        effects: columns of all directions, (N, K).
+        effects: all K directions with N rows, (N, K), of which a column names its own.
     """
     selected_units = next(
         column.select_directions(effects) for column in columns if column.effect == name

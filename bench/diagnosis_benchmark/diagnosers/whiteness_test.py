@@ -41,6 +41,9 @@ class WhitenessTest(Diagnoser):
         A white residual gives "adequate". If no effect correlates by at least `MIN_CORRELATION`,
         the answer is "unknown"; effects that correlate almost as well as the best are its
         alternatives.
+
+        Args:
+            case: recording, simulator and effects, without the hidden causes.
         """
         with closing(RegressionEvidence.collect(case)) as evidence:
             p_value = _compute_whiteness_p_value(evidence)

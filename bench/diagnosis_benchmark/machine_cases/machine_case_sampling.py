@@ -187,6 +187,12 @@ def record_case(case: BenchmarkCase) -> RecordedCase:
 
     It states what a user knows: units, constants or the model file, held-out runs and sometimes the
     noise, but neither the hidden causes nor the true parameters.
+
+    Args:
+        case: the case of a servo or an arm.
+
+    Returns:
+        The recording, its system for the units, and the model file as text for an arm.
     """
     conditions = restore_conditions(case.name, case.system, case.asked)
     plant, times = conditions.make_machine(case.effects), conditions.runs.times
@@ -206,6 +212,7 @@ def record_case(case: BenchmarkCase) -> RecordedCase:
         # The recording states neither initial states nor constants of a run.
         runs.append(Run(str(number), times, channels, inputs, {}, {}, is_held_out))
     noise = conditions.noise.sigma if case.stated else {}
+    # The constants of an arm are in its model file.
     if is_arm:
         model = ModelFileReference(Path(MODEL_FILE_NAME), {}, {})
         recording = Recording(Path(), case.system, "", {}, noise, tuple(runs), model=model)

@@ -185,6 +185,9 @@ def _draw_servo_parameters(rng: np.random.Generator) -> dict[str, float]:
     typical servos. Only parameters that diagnosers fit are random; all other constants are those
     of the simulator.
 
+    Args:
+        rng: random generator of the case.
+
     Returns:
         All parameters by name: torque constant in N m/A, resistance in Ohm, inertia of the rotor
         in kg m^2, and the constants of the simulator.
@@ -204,8 +207,12 @@ def _draw_arm_parameters(rng: np.random.Generator) -> dict[str, float]:
     The names end with the number of the link, 1 for the upper arm and 2 for the forearm; ``length``
     is that of the upper arm. The moments of inertia are those of a rod, about m l^2 / 12.
 
+    Args:
+        rng: random generator of the case.
+
     Returns:
-        Parameters by name, SI units; see `machine_dynamics.ArmDynamics`.
+        Parameters by name, SI units. ``centre`` is the distance of the centre of mass from the
+        joint, and ``armature`` the inertia of the rotor.
     """
     # Lengths of upper arm and forearm in m, and their masses in kg.
     length, outer = rng.uniform(0.25, 0.45), rng.uniform(0.2, 0.35)

@@ -254,7 +254,7 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
     Args:
         runs: the runs with their commands.
         plant: machine with its parameters and hidden causes.
-        times: times of the steps, (K + 1,).
+        times: times at which the K steps begin and end, s, (K + 1,).
 
     Returns:
         Applied inputs, (L, K, N).
@@ -266,6 +266,7 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
         for run in range(run_count):
             levels: Array = runs.commands[run, :, joint]
             for name, coefficients in input_effects.items():
+                # These functions change each level by itself, as a gain or a dead band does.
                 if name in STEPWISE_INPUT_EFFECTS:
                     levels = STEPWISE_INPUT_EFFECTS[name](levels, *coefficients)
             (delay,) = input_effects.get("input.delay", (0.0,))
@@ -283,7 +284,7 @@ def _average_input(stamps: Array, levels: Array, times: Array, delay: float, lag
     Args:
         stamps: sample times, s, (T,).
         levels: input at each sample, held until the next one, (T,).
-        times: times of the steps, s, (K + 1,).
+        times: times at which the K steps begin and end, s, (K + 1,).
         delay: delay, s.
         lag: time constant of a first-order lag, s; 0 for none.
 
@@ -314,12 +315,16 @@ def _apply_lag(stamps: Array, levels: Array, query_times: Array, lag: float) -> 
 
     Args:
         stamps: sample times, s, (T,).
-        levels: input at each sample, (T,).
-        query_times: times, s, (K,).
+        levels: input at each sample, held until the next one, (T,).
+        query_times: K times, s, (K,).
         lag: time constant, s.
+
+    Returns:
+        Lagging input at the given times, (K,).
     """
     lagged_at_samples = np.empty_like(levels)
     lagged_at_samples[0] = levels[0]
+    # Share of the distance to the level that remains at the end of each interval.
     decay = np.exp(-np.diff(stamps) / lag)
     for level_index in range(len(stamps) - 1):
         lagged_at_samples[level_index + 1] = (

@@ -111,9 +111,14 @@ def split_name(text: str) -> list[str]:
 
     Words end at punctuation, at capital letters and before digits. Words such as ``qdes``, which
     consist of a quantity and a word for a command, are divided into both.
+
+    Args:
+        text: name of a column, file or joint.
     """
+    # A space before each capital letter.
     spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
     words: list[str] = []
+    # Split at punctuation and underscores, and between a letter and a digit.
     for part in re.split(r"[\W_]+|(?<=[^\W\d_])(?=\d)", spaced):
         word = part.lower()
         joined_words = _JOINED_WORDS_PATTERN.fullmatch(word)
@@ -135,6 +140,7 @@ def guess_role(column: LogColumn) -> Role | None:
         Command, position, velocity, force or other; None if nothing indicates a role.
     """
     column_words, file_words = _split_into_words(column)
+    # Role "other" has words for signals that are no command, such as errors and temperatures.
     if column_words & ROLE_KEYWORDS["command"] or (
         file_words & ROLE_KEYWORDS["command"] and not column_words & ROLE_KEYWORDS["other"]
     ):
@@ -278,6 +284,9 @@ def list_clock_columns(columns: Iterable[LogColumn]) -> list[LogColumn]:
     Time stamps increase from row to row. The order is: stamps of a message's header, other columns
     with a name or unit of time, and increasing columns with other names. A few repeated stamps are
     allowed in columns with a name or unit of time.
+
+    Args:
+        columns: all columns of one file.
     """
     header_stamps, named_stamps, increasing_columns = [], [], []
     for column in columns:

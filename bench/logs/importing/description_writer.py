@@ -195,7 +195,7 @@ class DescriptionWriter:
         return servo
 
     def _collect_servo_samples(self, name: str, joint: Joint) -> list[tuple[Array, Array, Array]]:
-        """Return times (s), commands and positions (T,) of a servo in each run, in rad or m.
+        """Collect times (s), commands and positions (T,) of a servo in each run, in rad or m.
 
         A command holds until the next one, since it has other sample times than the position. Runs
         without one of them are left out.
@@ -203,6 +203,9 @@ class DescriptionWriter:
         Args:
             name: name of the servo.
             joint: joint that it drives.
+
+        Returns:
+            One triple per run; none without a recorded position.
         """
         command = self._signals.inputs[f"u.{name}"]
         position = self._signals.get_position(joint.name)
@@ -229,6 +232,9 @@ class DescriptionWriter:
         """Return a path relative to the folder of the description, with forward slashes.
 
         On another drive of Windows no relative path exists, so the path is absolute.
+
+        Args:
+            path: path of a log or of the model file.
         """
         try:
             return Path(os.path.relpath(path, self._folder)).as_posix()

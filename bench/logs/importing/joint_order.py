@@ -160,16 +160,17 @@ def _compute_order_residual(
 
     Args:
         robot: Model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-        driven: Joints with their actuators.
-        commands: (J, T) their commands.
+        driven: J joints with their actuators.
+        commands: (J, T) their commands at T times.
         motion: (3, J, T) their positions, velocities and accelerations.
     """
     import mujoco
 
-    for (joint, _), q in zip(driven, motion[0], strict=True):
+    positions, _, _ = motion
+    for (joint, _), q in zip(driven, positions, strict=True):
         if joint.range is not None:
             low, high = joint.range
-            slack = 0.5 * (high - low)
+            slack = 0.5 * (high - low)  # half of the range, since limits may be inaccurate
             if q.min() < low - slack or q.max() > high + slack:
                 return np.inf
     model = copy.copy(robot.compiled)
@@ -240,7 +241,11 @@ def find_best_order(distances: Array) -> list[int]:
     commands u_i and positions q_j, found by linear assignment.
 
     Args:
-        distances: (J, J) mean square distance of each command (rows) from each position (columns).
+        distances: (J, J) mean square distance of each command (rows) from each position (columns),
+            for J joints.
+
+    Returns:
+        For each command the index of its position.
     """
     # SciPy's optimisers take a third of a second to import.
     from scipy.optimize import linear_sum_assignment
@@ -349,6 +354,9 @@ def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSi
     Args:
         logs: logs of all runs, with their time stamps and columns.
         signals: signals and their columns.
+
+    Returns:
+        Names of the joints and of their commands, and the values in SI units, or no values.
     """
     joints = [
         joint

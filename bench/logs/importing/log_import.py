@@ -76,6 +76,10 @@ def describe_logs(
 def write_checked_description(path: Path, text: str) -> None:
     """Write a description and read the recording; delete the description if that fails.
 
+    Args:
+        path: Path of the description.
+        text: Description in TOML.
+
     Raises:
         InputError: It cannot be written, or read.
     """
@@ -86,6 +90,6 @@ def write_checked_description(path: Path, text: str) -> None:
     write_files({path: text})
     try:
         load_recording(path)
-    except BaseException:
+    except BaseException:  # also if the user interrupts the reading
         path.unlink()
         raise

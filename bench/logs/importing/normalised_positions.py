@@ -141,6 +141,9 @@ def check_normalised_positions(recording: Recording) -> Iterator[Anomaly]:
 
     That is so if the description states degrees and all positions lie within -100 to 100. A `scale`
     in the description shows that the user knows the unit, so channels with one are not checked.
+
+    Args:
+        recording: the recording, whose description lies next to its table.
     """
     description = recording.path.with_suffix(".toml")
     if not description.is_file():

@@ -82,10 +82,13 @@ def group_logs_by_run(logs: Sequence[Path]) -> dict[str, RunFiles]:
 
 
 def _find_runs_in_folder(folder: Path) -> dict[str, RunFiles]:
-    """Return the runs of a folder, bag or dataset by name, including those one level below it.
+    """Find the runs of a folder, bag or dataset, including those one level below it.
 
     Args:
         folder: ROS bag, LeRobot dataset, or folder of files and of further folders.
+
+    Returns:
+        Files of each run by its name: that of the bag, the episode or the folder.
     """
     is_whole = is_bag(folder) or is_dataset(folder)
     parts = [folder] if is_whole else [folder, *sorted(folder.iterdir())]
@@ -113,7 +116,11 @@ def _find_runs_in_folder(folder: Path) -> dict[str, RunFiles]:
 
 
 def _make_run_per_group(run: RunFiles) -> dict[str, RunFiles]:
-    """Return a run for each group of an HDF5 file with several runs; otherwise an empty dict."""
+    """Return a run for each group of an HDF5 file with several runs; otherwise an empty dict.
+
+    Args:
+        run: run that consists of the file.
+    """
     if len(run.paths) != 1 or not is_hdf5(run.paths[0]):
         return {}
     groups = list_run_paths(run.paths[0])
@@ -248,10 +255,14 @@ class RunLogs:
         """Return a command (T,) at the sample times of a position, and that position (T,).
 
         Both are those of the first run. A command holds until the next one.
+
+        Args:
+            command: column of the command.
+            position: column of the position, perhaps of another file with other sample times.
         """
         if command.file == position.file:
             return command.values, position.values
-        # Seconds count from the first stamp of each file.
+        # Seconds count from the first stamp of each file, which differ by the offset.
         offset = self._starts[command.file] - self._starts[position.file]
         stamps = self.seconds[command.file] + offset
         return hold_signal(stamps, command.values, self.seconds[position.file]), position.values
@@ -265,7 +276,10 @@ class RunLogs:
         return self._cache[path]
 
     def _read_first_run(self) -> dict[str, LogFile]:
-        """Read the logs of the first run, by name; leave out unreadable logs of a folder.
+        """Read the logs of the first run; leave out unreadable logs of a folder.
+
+        Returns:
+            Content of each log by its name in the description.
 
         Raises:
             InputError: A file that the user named cannot be read, or no file can.
@@ -377,9 +391,15 @@ class RunLogs:
         )
 
     def _list_clocks(self, logs: Mapping[str, LogFile]) -> dict[str, list[tuple[LogColumn, str]]]:
-        """Return for each file the columns that may be its time stamps, with their units.
+        """Find for each file the columns that may be its time stamps, with their units.
 
         Files without such a column are left out with a message.
+
+        Args:
+            logs: Logs of the first run by file.
+
+        Returns:
+            By file, pairs of column and unit (s, ms, us or ns), the most likely first.
 
         Raises:
             InputError: A file that the user named has no such column, or no file has one.
@@ -450,7 +470,7 @@ def hold_signal(stamps: Array, values: Array, times: Array) -> Array:
     Before the first value, that value is returned.
 
     Args:
-        stamps: (N,) increasing times of the values, s.
+        stamps: (N,) increasing times of N values, s.
         values: (N,) values of the signal.
         times: (T,) times of the result, s.
     """

@@ -179,6 +179,9 @@ def _select_present_samples(
         times: (T,) times in seconds.
         command: (T,) command, in rad or m; NaN where missing.
         position: (T,) position, in rad or m; NaN where missing.
+
+    Returns:
+        Times, command and position of the samples at which both signals are known.
     """
     is_recorded = np.isfinite(position) & np.isfinite(command)
     return (

@@ -190,6 +190,9 @@ class SignalAssignment:
 
         The position counts only if it was assigned by the number of its column. The name is empty
         if there is neither.
+
+        Args:
+            joint: name of the joint.
         """
         position = self.get_position(joint)
         if position is not None and position.placement.is_order:

@@ -119,6 +119,9 @@ def _select_timestamps(run: Run) -> Array:
       the sensors share one clock, and the samples that a sensor lacks are empty cells. All sample
       times are returned.
     * Otherwise, those of the sensor that was read most often are returned.
+
+    Args:
+        run: recorded run; a channel is NaN where its sensor was not read.
     """
     recorded_masks = [np.isfinite(values) for values in run.channels.values()]
     is_recorded = max(
@@ -144,10 +147,14 @@ def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
 
     Such samples were not measured anew, and look like a delay. A run counts if it has significantly
     more of them than its quantisation causes by coincidence.
+
+    Args:
+        recording: Recording to check.
     """
     repeated_count, sample_count, runs = 0, 0, []
     for run in recording.runs:
         count, expected = _count_stale_samples(run)
+        # A count of independent events has the standard deviation sqrt(expected) (Poisson).
         if count > expected + SIGNIFICANCE_SIGMAS * np.sqrt(max(expected, 1.0)):
             repeated_count += count
             runs.append(run.name)
@@ -166,6 +173,9 @@ def _count_stale_samples(run: Run) -> tuple[int, float]:
 
     The system moves fast at a sample if some channel changes by at least `FAST_SIGNAL_STEPS`
     quantisation steps directly before or after it. Such a repetition is rarely a coincidence.
+
+    Args:
+        run: recorded run with its channels.
 
     Returns:
         The count, and the count to expect by coincidence, from the noise alone. It is estimated
@@ -247,6 +257,9 @@ def _check_gap(run: Run) -> Anomaly | None:
     """Find a gap that is more than `MAX_GAP_RATIO` times as long as the rest of the run.
 
     Such a run probably consists of two. Return None if there is no such gap.
+
+    Args:
+        run: recorded run with its sample times.
     """
     intervals = np.diff(run.times)
     longest = int(intervals.argmax())
@@ -496,6 +509,9 @@ def _list_driven_positions(kind: type[Simulator]) -> list[tuple[str, str]]:
     """Return pairs of names: an input, and the channel of a position that it may drive.
 
     For a robot, it is the position of the actuator's joint; for other systems, each coordinate.
+
+    Args:
+        kind: simulator class of the recording's system.
     """
     if not issubclass(kind, SystemSimulator):
         return []

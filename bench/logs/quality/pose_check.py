@@ -35,8 +35,8 @@ def find_contacts(
 
     Args:
         kind: Simulator class of the robot.
-        positions: (N,) position of each joint, rad or m, by channel; other joints keep their
-            initial position.
+        positions: (N,) position of each joint at N times, rad or m, by channel; other joints keep
+            their initial position.
 
     Returns:
         Pairs of the geoms' numbers in MuJoCo, the smaller one first.
@@ -115,7 +115,11 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
 
 
 def _can_touch(model: Any) -> bool:
-    """Return whether any contact can arise in a compiled model (mujoco.MjModel)."""
+    """Return whether any contact can arise in a compiled model.
+
+    Args:
+        model: compiled model (mujoco.MjModel).
+    """
     # These imports are needed for robots only.
     import mujoco
 
@@ -138,6 +142,9 @@ def _select_acting_pairs(
         model: Compiled model (mujoco.MjModel).
         pairs: Pairs of geoms that touch.
         recorded_trees: Kinematic trees (`MjModel.body_treeid`) with recorded joints.
+
+    Returns:
+        The pairs in their order.
     """
     trees_by_pair = {
         pair: {int(model.body_treeid[model.geom_bodyid[geom]]) for geom in pair} - {_STATIC_TREE}

@@ -153,6 +153,9 @@ class VelocityComparison(NamedTuple):
 
         Each velocity is first multiplied by its slope, the factor from the integrated velocity to
         the change of the position, so that a wrong unit has no influence.
+
+        Args:
+            comparisons: comparison of each joint.
         """
         return VelocityComparison(
             np.concatenate([c.position_changes for c in comparisons]),
