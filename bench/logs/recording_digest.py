@@ -60,7 +60,7 @@ def compute_content_digest(path: Path) -> bytes:
         path: path of the file, perhaps with an episode, a topic or a group behind it.
 
     Returns:
-        SHA-256 in binary form.
+        SHA-256 in binary form; empty for an episode that cannot be listed.
     """
     episode = split_episode_path(path)
     if episode is not None:

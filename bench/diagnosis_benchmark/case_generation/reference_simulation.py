@@ -94,16 +94,7 @@ def simulate_with_scipy(
     Returns:
         Readings, (T, C).
     """
-    times = scenario.times - scenario.times[0]
-    instants = times
-    for name, coefficients in true_system.effects.items():
-        if name == "sensor.delay":
-            instants = instants - coefficients[0]
-        elif name == "clock.skew":
-            instants = instants * (1 + coefficients[0])
-    # The motion is known from time 0 on: before it, a delayed sensor shows the initial state. The
-    # simulation needs times that do not decrease.
-    instants = np.maximum.accumulate(np.maximum(instants, 0.0))
+    instants = _compute_read_times(true_system.effects, scenario.times - scenario.times[0])
     grid, sample_indices = (
         _refine_time_grid(instants)
         if "sensor.lag" in true_system.effects
@@ -126,6 +117,29 @@ def simulate_with_scipy(
         elif name == "sensor.lag":
             observed = _apply_lag(observed, grid, coefficients[0])
     return observed[sample_indices]
+
+
+def _compute_read_times(effects: EffectCoefficients, times: Array) -> Array:
+    """Compute the times at which the sensors read the motion, with a delay and a wrong clock.
+
+    The effects act in their order. The motion is known from time 0 on: before it, a delayed sensor
+    shows the initial state.
+
+    Args:
+        effects: coefficients of the hidden effects by name.
+        times: sample times since the first sample, s, (T,).
+
+    Returns:
+        Times that do not decrease, at least 0, s, (T,).
+    """
+    instants = times
+    for name, coefficients in effects.items():
+        if name == "sensor.delay":
+            instants = instants - coefficients[0]
+        elif name == "clock.skew":
+            instants = instants * (1 + coefficients[0])
+    read_times: Array = np.maximum.accumulate(np.maximum(instants, 0.0))
+    return read_times
 
 
 def simulate_with_mujoco(

@@ -179,19 +179,10 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
     observe = list(default_recording.observe) or (
         channels if rng.random() < ALL_CHANNELS_SHARE else channels[:1]
     )
-    # Input signals as texts: amplitude, then the duration of a step in s or frequencies in Hz.
-    forms = ("steps:{size}:{duration}", "sine:{size}:{frequency}", "chirp:{size}:0.3:{frequency}")
     inputs = dict(default_recording.inputs)
     # A servo keeps its usual input, and half of the rotary systems are not driven.
     if kind.inputs and not system.servo and (system.kind != "rotary" or rng.random() < 0.5):
-        # Torque in N m or force in N.
-        size = rng.uniform(0.05, 0.2) if system.kind == "rotary" else rng.uniform(0.5, 4.0)
-        text = str(rng.choice(forms)).format(
-            size=f"{size:.3g}",
-            duration=f"{rng.uniform(0.25, 1.0):.3g}",
-            frequency=f"{rng.uniform(0.3, 2.5):.3g}",
-        )
-        inputs[kind.inputs[0].name] = text
+        inputs[kind.inputs[0].name] = _draw_input_text(system.kind == "rotary", rng)
     specification = SimulationSpec(
         system=kind.name,
         parameters=parameters,
@@ -211,6 +202,26 @@ def _simulate_example(training_task: DiagnoserTrainingTask, name: str, number: i
     # An effect must be visible above the noise; without an effect the residual is noise alone.
     is_visible = not name or residual_rms >= min_residual
     return image if is_visible and residual_rms <= max_residual else None
+
+
+def _draw_input_text(is_rotary: bool, rng: np.random.Generator) -> str:
+    """Draw an input signal for a training example, as the text of a `SimulationSpec`.
+
+    The text has the form, the amplitude, and the duration of a step in s or frequencies in Hz, such
+    as ``sine:2:0.5``.
+
+    Args:
+        is_rotary: whether the input is a torque (N m) and not a force (N).
+        rng: random generator of the training.
+    """
+    forms = ("steps:{size}:{duration}", "sine:{size}:{frequency}", "chirp:{size}:0.3:{frequency}")
+    size = rng.uniform(0.05, 0.2) if is_rotary else rng.uniform(0.5, 4.0)
+    # A form uses only some of the numbers, but all are drawn.
+    return str(rng.choice(forms)).format(
+        size=f"{size:.3g}",
+        duration=f"{rng.uniform(0.25, 1.0):.3g}",
+        frequency=f"{rng.uniform(0.3, 2.5):.3g}",
+    )
 
 
 def _draw_coefficients(training_task: DiagnoserTrainingTask, name: str) -> tuple[float, ...]:

@@ -315,7 +315,7 @@ class RegressionEvidence:
             The filtered trajectories, the standard deviation of their noise (R, T, C), and the mask
             of the samples to use (R, T, C).
         """
-        from scipy.signal import savgol_coeffs, savgol_filter
+        from scipy.signal import savgol_coeffs
 
         evaluator, system = self.evaluator, self.evaluator.simulator.system
         runs, length, channels, _ = values.shape
@@ -336,40 +336,18 @@ class RegressionEvidence:
                 is_rate = name in coordinate_by_rate
                 if not is_rate and name not in system.coordinates:
                     continue
-                channel_values = values[run_index, :size, channel_index]
-                order = 1 if is_rate else 2
-
-                def smooth(
-                    deriv: int,
-                    channel_values: Array = channel_values,
-                    window: int = window,
-                    step: float = step,
-                ) -> Array:
-                    """Compute a derivative (T, K) by local polynomials (Savitzky-Golay filter).
-
-                    The default values bind the loop variables of the current run and channel.
-
-                    Args:
-                        deriv: order of the derivative; 0 for the smoothed values.
-                        channel_values: K trajectories of the channel, (T, K).
-                        window: number of samples of the window.
-                        step: sampling interval, s.
-                    """
-                    filtered: Array = savgol_filter(
-                        channel_values, window, POLYNOMIAL_DEGREE, deriv=deriv, delta=step, axis=0
-                    )
-                    return filtered
-
                 coordinate = system.coordinates.index(coordinate_by_rate.get(name, name))
-                filtered_residual = smooth(order)
-                if is_rate:
-                    filtered_residual -= damping[:size, coordinate, None] * smooth(0)
-                else:
-                    filtered_residual -= stiffness[:size, coordinate, None] * smooth(0)
-                    filtered_residual -= damping[:size, coordinate, None] * smooth(1)
-                filtered_runs[run_index, :size, channel_index] = filtered_residual
+                filtered_runs[run_index, :size, channel_index] = _compute_residual_force(
+                    values[run_index, :size, channel_index],
+                    is_rate,
+                    stiffness[:size, coordinate, None],
+                    damping[:size, coordinate, None],
+                    window,
+                    step,
+                )
                 # White noise through a filter: its variance is multiplied by the sum of the squared
                 # weights. The noise of the smaller terms with A and B is neglected.
+                order = 1 if is_rate else 2
                 weights = savgol_coeffs(window, POLYNOMIAL_DEGREE, deriv=order, delta=step)
                 sigma[run_index, :size, channel_index] = self.noise.sigma[channel_index] * np.sqrt(
                     np.square(weights).sum()
@@ -456,6 +434,39 @@ class RegressionEvidence:
 
 _IMPACT_HEIGHT = 1.0
 """Height in metres below which a minimum of the last coordinate counts as an impact."""
+
+
+def _compute_residual_force(
+    values: Array, is_rate: bool, stiffness: Array, damping: Array, window: int, step: float
+) -> Array:
+    """Compute L r = r'' - A r - B r' (2) for trajectories r of one channel by local polynomials.
+
+    For a channel that is a rate, r' is recorded in place of r: its first derivative replaces r'',
+    and the term with A is omitted.
+
+    Args:
+        values: K trajectories of the channel, (T, K).
+        is_rate: whether the channel is a rate (velocity) and not a coordinate.
+        stiffness: A, (T, 1).
+        damping: B, (T, 1).
+        window: number of samples of the window of the polynomials.
+        step: sampling interval, s.
+
+    Returns:
+        L r, (T, K): the acceleration that no displacement explains, m/s^2 or rad/s^2.
+    """
+    from scipy.signal import savgol_filter
+
+    def differentiate(order: int) -> Array:
+        """Return a derivative (T, K) of the trajectories; for order 0 the smoothed values."""
+        filtered: Array = savgol_filter(
+            values, window, POLYNOMIAL_DEGREE, deriv=order, delta=step, axis=0
+        )
+        return filtered
+
+    if is_rate:
+        return differentiate(1) - damping * differentiate(0)
+    return differentiate(2) - stiffness * differentiate(0) - damping * differentiate(1)
 
 
 def _round_down_to_odd(samples: int) -> int:

@@ -557,15 +557,35 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     predicted = regressors @ coefficients  # Equation (1).
     if np.var(positions - predicted) > (1.0 - MIN_EXPLAINED_VARIANCE) * np.var(positions):
         return
-    velocity = np.gradient(predicted, step)
-    # What (1) and a constant delay explain must not count as drift: only the part of the drift's
-    # response that is orthogonal to both determines it.
+    estimate = _fit_drift(time, positions, regressors, np.gradient(predicted, step))
+    if estimate is not None:
+        yield estimate
+
+
+def _fit_drift(
+    time: Array, positions: Array, regressors: Array, velocity: Array
+) -> _Estimate | None:
+    """Fit the drift e, the growth of a delay per time, to a position by least squares.
+
+    To first order, the position changes by -e t p' (2), with the predicted velocity p'. What the
+    regressors and a constant delay (the velocity) explain must not count as drift: only the part of
+    -t p' that is orthogonal to both determines it.
+
+    Args:
+        time: (N,) times of the N samples about their mean, s.
+        positions: (N,) recorded positions.
+        regressors: (N, K) columns by which the commands explain the position, equation (1).
+        velocity: (N,) velocity p' that the commands predict.
+
+    Returns:
+        The drift and its standard error; None if nothing is orthogonal.
+    """
     basis, _ = np.linalg.qr(np.column_stack([regressors, velocity]))
     delay_response = -time * velocity
     delay_response = delay_response - basis @ (basis.T @ delay_response)
     response_power = float(delay_response @ delay_response)
     if not response_power > 0:
-        return
+        return None
     drift = float(delay_response @ positions) / response_power
     residual = positions - basis @ (basis.T @ positions) - drift * delay_response
     # The residual is autocorrelated, but hardly over more than the memory of (1): sums over blocks
@@ -578,7 +598,8 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
         * float(np.sqrt(block_sums @ block_sums))
         / response_power
     )
-    yield _Estimate(drift, float(np.hypot(error, MODEL_ERROR_SHARE * drift)))
+    # The truncation of (2) adds an error in proportion to the drift.
+    return _Estimate(drift, float(np.hypot(error, MODEL_ERROR_SHARE * drift)))
 
 
 def _average_over_intervals(command: Array) -> Array:
