@@ -141,11 +141,32 @@ def write_report(
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()
     failed = shot_rows[shot_rows["status"].isin(NO_SHOT_STATUSES)]
+    for text_line in _render_summary(result_lines, failed, skipped_tuners, folder, figures):
+        print_line(text_line)
+    return int(failed["status"].isin(_FAILED_STATUSES).sum())
+
+
+def _render_summary(
+    result_lines: pd.DataFrame,
+    failed: pd.DataFrame,
+    skipped_tuners: Mapping[str, str],
+    folder: Path,
+    figures: Sequence[Path],
+) -> list[str]:
+    """Render the lines of the summary that the command prints: hits by method and ball.
+
+    Args:
+        result_lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
+        failed: rows of shots.csv of methods without a shot.
+        skipped_tuners: reasons why tuners cannot be used here, by label.
+        folder: result folder.
+        figures: paths of the figures.
+    """
     # Lines of the result table by method and ball.
     lines_by_method: dict[str, dict[str, Any]] = {}
     for line in result_lines.to_dict("records"):
         lines_by_method.setdefault(line["method"], {})[line["ball"]] = line
-    summary = render_text(
+    return render_text(
         _SUMMARY_TEMPLATE,
         methods=lines_by_method,
         balls=[ball for ball in result_lines["ball"].unique() if ball != ALL_BALLS],
@@ -157,9 +178,6 @@ def write_report(
         figures=figures,
         report_file=REPORT_FILE,
     )
-    for text_line in summary:
-        print_line(text_line)
-    return int(failed["status"].isin(_FAILED_STATUSES).sum())
 
 
 def _build_status_rows(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:

@@ -129,6 +129,10 @@ def read_shot(folder: Path, setup: ShotSetup) -> dict[str, Any] | None:
         folder: result folder of the study.
         setup: setup of the shot: its ball, drop, incline and hoop.
 
+    Returns:
+        ``models``, the tuned model of each method as a dictionary, and ``rows``, the row of
+        shots.csv of each method, in the same order.
+
     Raises:
         InputError: the file is damaged.
     """
@@ -194,6 +198,7 @@ def _validate_document(document: dict[str, Any], name: str, columns: Columns) ->
         for column in columns:
             check_cells(column, parse_json_column(column, [table[column.name] for table in tables]))
     except CellError as error:
+        # Tables are numbered from 1 in messages.
         error.says = f"{name}, {(error.row or 0) + 1}: {error.says}"
         raise
 

@@ -131,6 +131,7 @@ def render_page(data: DiagnoserReportData) -> str:
     tables |= build_chart_tables(data)
     page.add_tables(tables, _DIGITS)
     groups, confusion, costs = (data.tables[name] for name in ("groups", "confusion", "costs"))
+    # Entries of the page's menus; the first choices are set below.
     metrics = list(dict.fromkeys(groups["metric"]))
     confused = list(dict.fromkeys(confusion["diagnoser"]))
     better_diagnosers = list_better_diagnosers(data)

@@ -88,20 +88,9 @@ def write_report(
     write_figures(folder, report_data.pictures)
     write_atomically(folder / REPORT_FILE, render_page(report_data))
     failed = rows[rows["status"] != "done"]
-    lines = render_text(
-        _TEMPLATE,
-        shown=report_data,
-        shares={metric: index_by_diagnoser(tables["table"], metric) for metric in _SUMMARY_METRICS},
-        columns=list(_SUMMARY_METRICS.values()),
-        costs=index_by_diagnoser(tables["costs"]),
-        unsupported=summarise_unsupported(left_out),
-        undetectable_count=sum(not answer["item"] for answer in answers.values()),
-        answers_file=ANSWERS_TABLE_FILE,
-        report_path=folder / REPORT_FILE,
-        failed=failed.to_dict("records"),
-        max_failures=_MAX_LISTED_FAILURES,
-    )
-    for line in lines:
+    # The document of a case is empty if the sensors cannot show its hidden cause.
+    undetectable_count = sum(not answer["item"] for answer in answers.values())
+    for line in _render_summary(report_data, failed, undetectable_count, folder / REPORT_FILE):
         print_line(line)
     return len(failed)
 
@@ -117,6 +106,33 @@ _SUMMARY_METRICS = {
 """Metrics of the printed leaderboard, with the headings of their columns."""
 _MAX_LISTED_FAILURES = 5
 """Maximum number of failed answers that are printed."""
+
+
+def _render_summary(
+    data: DiagnoserReportData, failed: pd.DataFrame, undetectable_count: int, report_path: Path
+) -> list[str]:
+    """Render the lines of the summary that the command prints: a leaderboard with costs.
+
+    Args:
+        data: graded answers and result tables of all diagnosers.
+        failed: rows of the failed answers.
+        undetectable_count: number of cases whose hidden cause the sensors cannot show.
+        report_path: path of the HTML report.
+    """
+    table = data.tables["table"]
+    return render_text(
+        _TEMPLATE,
+        shown=data,
+        shares={metric: index_by_diagnoser(table, metric) for metric in _SUMMARY_METRICS},
+        columns=list(_SUMMARY_METRICS.values()),
+        costs=index_by_diagnoser(data.tables["costs"]),
+        unsupported=summarise_unsupported(data.left_out),
+        undetectable_count=undetectable_count,
+        answers_file=ANSWERS_TABLE_FILE,
+        report_path=report_path,
+        failed=failed.to_dict("records"),
+        max_failures=_MAX_LISTED_FAILURES,
+    )
 
 
 def format_csv(frame: pd.DataFrame) -> str:

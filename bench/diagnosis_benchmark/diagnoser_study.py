@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
 from bench.benchmark.isolation.process_errors import RunEndedError
+from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.runner.code_digest import hash_class_source
 from bench.benchmark.runner.experiment_runner import ProgressFactory, no_progress
@@ -299,7 +300,6 @@ class _EvaluationRun:
         Raises:
             BaseException: a worker failed otherwise than by the diagnoser or the time limit.
         """
-        trusted = self._experiment.trusted
         # The model file of a robot is not known before its case, so no diagnoser can train for it.
         required_systems = {question.system for question in self._study.cases}
         systems = sorted(required_systems & set(simulators.names()))
@@ -307,22 +307,8 @@ class _EvaluationRun:
         learning_diagnosers = [name for name in codes if diagnosers.get(name).learned]
         # calls[i] is the training of trainings[i].
         trainings = [(name, system) for name in learning_diagnosers for system in systems]
-        budget = self._experiment.training_budget
-        calls: list[Call] = [
-            (
-                train_or_load,
-                (
-                    codes[name],
-                    hash_class_source(diagnosers.get(name)),
-                    system,
-                    budget,
-                    MAX_TRAINING_SECONDS,
-                    self._hidden,
-                    trusted,
-                ),
-            )
-            for name, system in trainings
-        ]
+        calls = [self._make_training_call(name, codes[name], system) for name, system in trainings]
+        # Files of trained arrays by diagnoser and system.
         files: dict[str, dict[str, Path]] = {name: {} for name in codes}
         training_costs = []
         step = self._progress("training", len(calls)) if calls else None
@@ -341,8 +327,33 @@ class _EvaluationRun:
                 raise result
             if step:
                 step()
-        evaluated = {n: EvaluatedDiagnoser(n, code, files[n], trusted) for n, code in codes.items()}
+        evaluated = {
+            name: EvaluatedDiagnoser(name, code, files[name], self._experiment.trusted)
+            for name, code in codes.items()
+        }
         return evaluated, training_costs
+
+    def _make_training_call(self, name: str, code: TunerSpec, system: str) -> Call:
+        """Make the call by which a worker trains a diagnoser for a system, or loads the result.
+
+        Args:
+            name: registered name of the diagnoser.
+            code: module or plugin file of its code.
+            system: name of the system, such as ``pendulum``.
+
+        Returns:
+            Function and arguments.
+        """
+        arguments = (
+            code,
+            hash_class_source(diagnosers.get(name)),
+            system,
+            self._experiment.training_budget,
+            MAX_TRAINING_SECONDS,
+            self._hidden,
+            self._experiment.trusted,
+        )
+        return train_or_load, arguments
 
     def _evaluate_open_cases(
         self, workers: Pool, questions: Sequence[CaseSpec], evaluated: dict[str, EvaluatedDiagnoser]

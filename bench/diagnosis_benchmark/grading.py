@@ -266,6 +266,7 @@ def _check_interval_coverage(
                 intervals[f"{cause['effect']}.{name}"] = cause["coefficients"].get(name)
     if not set(case.effects) <= leading_causes:
         return {}  # parameters fitted together with a wrong cause are not comparable
+    # Not every diagnoser gives intervals for all numbers.
     return {
         name: contains_value(intervals[name], value)
         for name, value in truth.items()

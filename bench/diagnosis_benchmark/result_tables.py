@@ -51,10 +51,10 @@ _MAX_REASON_LENGTH = 200
 
 
 def build_answer_rows(answered: AnswersByCase, diagnosers: Sequence[str]) -> pd.DataFrame:
-    """Build the result rows, ordered by diagnoser and then by case.
+    """Build the result rows, one per answer, ordered by diagnoser and then by case.
 
     Args:
-        answered: stored answers.
+        answered: stored answers by name of the case.
         diagnosers: names of the diagnosers.
     """
     rows = [row for name in diagnosers for row in _iterate_rows(name, answered)]

@@ -71,24 +71,30 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
                 held_out=run_index >= calibration.runs - calibration.held_out,
             )
         )
+    # The recording names the simulator to be extended, not the true system.
     kind = type(problem.simulator)
-    model = None
-    if experiment.model:
-        model = ModelFileReference(
-            find_model(experiment.model, experiment.name),
-            dict(experiment.actuators),
-            {},
-            experiment.free,
-        )
     noise = {c.name: float(s) for c, s in zip(problem.channels, problem.noise, strict=True) if s}
     constants = problem.simulator.constant_values
     title = f"{experiment.name}, calibration"
-    write_recording(
-        path,
-        Recording(path, kind.name, title, constants, noise, tuple(runs), model=model),
-        kind,
-        digits=9,
-    )
+    model = _make_model_reference(experiment)
+    recording = Recording(path, kind.name, title, constants, noise, tuple(runs), model=model)
+    write_recording(path, recording, kind, digits=9)
     problem.close()
     parameters: Array = theta[0]
     return parameters
+
+
+def _make_model_reference(experiment: Experiment) -> ModelFileReference | None:
+    """Make the reference to the model file of an experiment's robot; None for other systems.
+
+    Args:
+        experiment: the experiment, with the model file, added actuators and free numbers.
+    """
+    if not experiment.model:
+        return None
+    return ModelFileReference(
+        find_model(experiment.model, experiment.name),
+        dict(experiment.actuators),
+        {},
+        experiment.free,
+    )

@@ -149,6 +149,8 @@ def draw_case(
     fitted_setting = replace(
         setting, scenarios=setting.scenarios[: case.runs - count_held_out_runs(case)]
     )
+    # The first function finds the coefficients of a cause, the second one computes the residual
+    # that the best wrong answer leaves.
     return case.hide(
         hidden,
         target_size,

@@ -496,7 +496,7 @@ def _draw_end_stop(
 
     Returns:
         Function from the strength to stiffness (its sign is the side of the stop), position, and
-        damping.
+        loss: the damping as a factor of the approach velocity.
     """
     side, share_beyond = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
     stop_quantile = 1 - share_beyond if side > 0 else share_beyond

@@ -61,8 +61,10 @@ class JointDynamics:
     def __init__(self, true_system: TrueSystem, number: int) -> None:
         """Collect the laws of the system and of its hidden causes, for one run.
 
-        Further attributes:
-
+        * `weight`: generalised force of gravity, by position,
+        * `forces`, `limits`: laws of forces and of dry friction limits, as functions of time,
+          position and velocity,
+        * `inertia`: inertia of the drive side, without the loads of hidden-state effects,
         * `sideways`: generalised force of a unit horizontal acceleration, by position,
         * `latched`: whether the cause `latch` acts in this run (every other run),
         * `breaks`: times at which a gust begins and ends, s,
@@ -359,10 +361,13 @@ class DahlReferenceFriction:
     def force(self, x: float, v: float, _: float, strain: float) -> float:
         """Compute the friction force on the mass.
 
+        All hidden-state effects have the same arguments; of these, only `strain` is used.
+
         Args:
             x: position.
             v: velocity.
-            strain: friction force as a fraction of its limit.
+            _: first hidden state.
+            strain: second hidden state, the friction force as a fraction of its limit.
         """
         return -self.limit * strain
 
@@ -564,9 +569,8 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
     """Integrate until the next standstill, break-away or end of the input interval.
 
     A resting coordinate that dry friction can hold is not moved: only its hidden states are
-    integrated, or the time of break-away (at which it begins to slide) is searched. Otherwise
-    friction opposes the direction of motion `direction` (+1 or -1), and an event stops the
-    integration when the velocity changes its sign.
+    integrated, or the time of break-away (at which it begins to slide) is searched. Otherwise it
+    moves, from rest in the direction of the force.
 
     Args:
         joint: the equation of motion, with its input interval.
@@ -575,19 +579,41 @@ def _integrate_until_stop(joint: JointDynamics, start: float, state: Array) -> S
 
     Returns:
         End time, state at that time, and the dense solution (None without motion).
-
-    Raises:
-        RuntimeError: the solver failed.
     """
-    (x, v, *z), end = state, joint.segment.end
+    x, v, *z = state
     direction = copysign(1.0, v) if v else 0.0
     if joint.limits and v == 0.0:  # dry friction, and the coordinate rests
         force = joint.compute_force(start, x, 0.0, *z)
         if abs(force) <= joint.compute_friction_limit(start, x, 0.0):
             if z:
                 return _integrate_stuck(joint, start, state)
+            # Without hidden states nothing moves, so there is nothing to integrate.
             return _find_break_away(joint, start, x), state, None
         direction = copysign(1.0, force)
+    return _integrate_motion(joint, start, state, direction)
+
+
+def _integrate_motion(
+    joint: JointDynamics, start: float, state: Array, direction: float
+) -> SegmentResult:
+    """Integrate a moving coordinate until its next standstill or the end of the input interval.
+
+    Dry friction opposes the direction of motion, and an event stops the integration when the
+    velocity changes its sign. Without dry friction, there is no such event.
+
+    Args:
+        joint: the equation of motion, with its input interval.
+        start: begin, s.
+        state: position, velocity and hidden states.
+        direction: direction of motion, +1 or -1; 0 at rest without dry friction.
+
+    Returns:
+        End time, state at that time, and the dense solution.
+
+    Raises:
+        RuntimeError: the solver failed.
+    """
+    end = joint.segment.end
 
     def compute_derivatives(t: float, y: Array) -> list[float]:
         """Return the time derivatives of position, velocity and hidden states.
@@ -655,10 +681,9 @@ def _integrate_stuck(joint: JointDynamics, start: float, state: Array) -> Segmen
             t: time, s.
             y: position, velocity and hidden states.
         """
+        x, v, *_ = y
         # Slightly above the limit: at the limit, the coordinate would still count as held.
-        return abs(joint.compute_force(t, *y)) - joint.compute_friction_limit(t, *y[:2]) * (
-            1 + 1e-9
-        )
+        return abs(joint.compute_force(t, *y)) - joint.compute_friction_limit(t, x, v) * (1 + 1e-9)
 
     break_away_event: Any = excess
     break_away_event.terminal, break_away_event.direction = True, 1

@@ -149,15 +149,16 @@ def _interpolate_input(levels: Array, edges: Array, share: float) -> tuple[Array
     next value meanwhile. It is approximated by short constant parts.
 
     Args:
-        levels: input at each sample.
-        edges: time of each sample.
+        levels: input at each of N samples, (N,).
+        edges: time of each sample, s, (N,).
         share: 0 for a zero-order hold, 1 for linear interpolation.
 
     Returns:
-        Levels and begins of the parts.
+        Levels and begins of the parts: `SUBDIVISIONS` for each interval, and the last sample.
     """
     # Relative times of the middles of the parts: each part has the level of its middle.
     parts = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS
+    # One row for each interval, one column for each part.
     fine_levels = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
     starts = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(SUBDIVISIONS) / SUBDIVISIONS
     return np.append(fine_levels.ravel(), levels[-1]), np.append(starts.ravel(), edges[-1])
@@ -179,24 +180,25 @@ def _limit_input_rate(levels: Array, edges: Array, max_rate: float) -> tuple[Arr
     """
     # The last level is held for another second, in which it may still be approached.
     end_times = [*edges[1:].tolist(), edges[-1] + 1.0]
-    values, starts, state = [], [], float(levels[0])
+    values, starts, output = [], [], float(levels[0])
     for level, start, end in zip(levels.tolist(), edges.tolist(), end_times, strict=True):
-        while start < end and state != level:
+        while start < end and output != level:
             end_of_step = min(start + SLEW_STEP, end)
-            deviation = level - state
+            deviation = level - output
             seconds_to_level = abs(deviation) / max_rate
             ramp_duration = min(seconds_to_level, end_of_step - start)
             # Exactly the level if it is reached, so that the loop ends.
-            next_state = (
+            next_output = (
                 level
                 if ramp_duration >= seconds_to_level
-                else state + copysign(max_rate * ramp_duration, deviation)
+                else output + copysign(max_rate * ramp_duration, deviation)
             )
             # Mean over the part, in which the ramp may end.
             ramp_share = ramp_duration / (end_of_step - start)
-            values.append(0.5 * (state + next_state) * ramp_share + next_state * (1 - ramp_share))
+            mean_on_ramp = 0.5 * (output + next_output)
+            values.append(mean_on_ramp * ramp_share + next_output * (1 - ramp_share))
             starts.append(start)
-            state, start = next_state, end_of_step
+            output, start = next_output, end_of_step
         if start < end:  # the level is reached and held
             values.append(level)
             starts.append(start)

@@ -337,6 +337,7 @@ def _choose_starts(
     for factor in (1.0,) if probes[0].is_single_size else (1.0, 0.3):
         start_coefficients = probes[0].coefficients.copy()
         for probe, size in zip(probes, sizes.tolist(), strict=True):
+            # A probe of a single size keeps the coefficients with which it was simulated.
             if not probe.is_single_size:
                 start_coefficients[probe.coefficient_index] = np.clip(
                     factor * size, *bounds[probe.coefficient_index]

@@ -151,6 +151,10 @@ def parse_answer(text: str) -> Answer:
 
     Decoding is tried from every opening brace, since braces occur in the words, too.
 
+    Args:
+        text: answer of the model; only its end is searched, at most `_MAX_ANSWER_LENGTH`
+            characters.
+
     Raises:
         InputError: there is none, or it is not a valid answer.
     """

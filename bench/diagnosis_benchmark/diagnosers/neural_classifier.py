@@ -278,6 +278,7 @@ def _compute_network_input(
         Input of the network, (R, F, `GRID_POINT_COUNT`) for R runs and F rows, and the RMS of the
         residuals in units of the noise.
     """
+    # The base model is fitted to all runs, without any effect.
     with closing(
         RunEvaluator(kind, recording, list(recording.runs), "batch", candidates=())
     ) as evaluator:
@@ -287,9 +288,10 @@ def _compute_network_input(
         rms = float(np.sqrt(np.nanmean(np.square(residual))))
         names = [channel.name for channel in kind.channels]
         inputs = [channel.name for channel in kind.inputs]
-        image = np.zeros(
-            (len(evaluator.prepared_runs), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT)
-        )
+        # First rows of the motion, of the marks of recorded channels, and of the inputs.
+        first_motion_row, first_mark_row, first_input_row = (k * len(names) for k in (1, 2, 3))
+        row_count = first_input_row + len(inputs) + 1
+        image = np.zeros((len(evaluator.prepared_runs), row_count, GRID_POINT_COUNT))
         grid = np.linspace(0.0, 1.0, GRID_POINT_COUNT)
         for run_index, run_data in enumerate(evaluator.prepared_runs):
             size = int(evaluator.lengths[run_index])
@@ -306,16 +308,16 @@ def _compute_network_input(
                     np.interp(grid, relative_times[is_recorded], clipped_residual[is_recorded])
                 )
                 motion = fit.simulated[run_index, :size, recorded_index]
-                spread = float(motion.std()) or 1.0
-                image[run_index, len(names) + channel_index] = np.interp(
+                spread = float(motion.std()) or 1.0  # 1 if the channel does not move
+                image[run_index, first_motion_row + channel_index] = np.interp(
                     grid, relative_times, (motion - motion.mean()) / spread
                 )
-                image[run_index, 2 * len(names) + channel_index] = 1.0
+                image[run_index, first_mark_row + channel_index] = 1.0
             for input_index, name in enumerate(inputs):
                 signal = np.asarray(run_data.scenario.inputs.get(name, np.zeros(size)))[:size]
-                spread = float(np.abs(signal).max()) or 1.0
-                image[run_index, 3 * len(names) + input_index] = np.interp(
-                    grid, relative_times, signal / spread
+                peak = float(np.abs(signal).max()) or 1.0  # 1 without input
+                image[run_index, first_input_row + input_index] = np.interp(
+                    grid, relative_times, signal / peak
                 )
             image[run_index, -1] = np.log(run_data.duration)
     return np.nan_to_num(image), rms
@@ -372,9 +374,10 @@ def _make_network(features: int, classes: int) -> Any:
                 Logits, (B, classes).
             """
             batch, runs = images.shape[:2]
-            features = self.run(images.flatten(0, 1))
+            features = self.run(images.flatten(0, 1))  # (B R, LAYER_WIDTH, time)
             features = torch.cat([features.mean(dim=2), features.amax(dim=2)], dim=1)
             features = features.reshape(batch, runs, -1) * weights[..., None]
+            # Mean over the runs that exist.
             return self.decide(features.sum(dim=1) / weights.sum(dim=1, keepdim=True))
 
     return Network()

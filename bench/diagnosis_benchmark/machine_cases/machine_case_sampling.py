@@ -98,6 +98,8 @@ def draw_case(
     hidden = _choose_hidden_causes(kind, system, effect, rng)
     if not hidden:
         return case if kind == "clean" else None  # the two effects drawn are equivalent
+    # The first function finds the coefficients of a cause, the second one computes the residual
+    # that the best wrong answer leaves.
     return case.hide(
         hidden,
         target_size,

@@ -108,8 +108,8 @@ class MachineDynamics(ABC):
         Returns:
             Friction limits, (L, N).
         """
-        limit = np.tile(self.dry, (len(q), 1))
-        if self.extra.any():
+        limit = np.tile(self.dry, (len(q), 1))  # Coulomb friction, (L, N)
+        if self.extra.any():  # Stribeck friction
             limit += self.extra * np.exp(-((v / self.speed) ** 2))
         if self.patch:
             joint, max_friction, centre, half_width = self.patch
@@ -133,6 +133,7 @@ class MachineDynamics(ABC):
             Forces, (L, N).
         """
         total = self.compute_own_force(q, v, u)
+        # The force laws of the hidden effects.
         for compute_effect_force in self.acts:
             total = total + compute_effect_force(t, q, v, u)
         return total
@@ -173,9 +174,11 @@ class MachineDynamics(ABC):
     def _add_effect(self, effect: str, place: str, c: list[float]) -> None:
         """Add a hidden cause to the equations of motion.
 
-        A force law or a tilt becomes a function in `acts`; friction, inertia, dead band and mass
-        change an attribute. Effects on commands (``input.``) and sensors (``sensor.``) are ignored
-        here; `machine_simulation` applies them.
+        A force law or a tilt becomes a function in `acts`. Other effects change an attribute:
+        Coulomb friction (`dry`), Stribeck friction at rest and its speed (`extra`, `speed`), the
+        inertia of a rotor (`added`), the dead band of a servo (`dull`), or a mass. Effects on
+        commands (``input.``) and sensors (``sensor.``) are ignored here; `machine_simulation`
+        applies them.
 
         Args:
             effect: name of the effect or unmodelled cause; a patch is dry friction in a region of a
@@ -251,6 +254,8 @@ class ServoDynamics(MachineDynamics):
     def compute_mass_matrix(self, q: Array) -> Array:
         """Compute the inertia J + m l^2 (L, 1, 1) about the joint, with that of hidden causes.
 
+        J is the inertia of the rotor, and the mass m is at the distance l from the joint.
+
         Shapes: L batch elements.
 
         Args:
@@ -258,6 +263,7 @@ class ServoDynamics(MachineDynamics):
         """
         n = self.numbers
         inertia = np.empty((len(q), 1, 1))
+        # `added` is the inertia of a hidden cause.
         inertia[:, 0, 0] = n["armature"] + n["mass"] * n["length"] ** 2 + self.added[0]
         return inertia
 
@@ -265,7 +271,8 @@ class ServoDynamics(MachineDynamics):
         """Compute motor torque k (d V - k q') / R and gravity, the right-hand side of equation (1).
 
         The position controller sets the duty d from the error of the goal; the motor's back EMF, k
-        q', reduces the torque.
+        q', reduces the torque. The motor has the torque constant k, the resistance R and the
+        voltage V.
 
         Shapes: L batch elements.
 
@@ -276,7 +283,7 @@ class ServoDynamics(MachineDynamics):
         """
         n = self.numbers
         error = u[:, 0] - q[:, 0]
-        if self.dull:  # the controller ignores errors within the dead band
+        if self.dull:  # hidden cause: the controller ignores errors within the dead band, rad
             error = error - np.clip(error, -self.dull, self.dull)
         duty = np.clip(n["kp"] * n["error_gain"] * error, -1.0, 1.0)
         k = n["torque_constant"]
@@ -285,7 +292,9 @@ class ServoDynamics(MachineDynamics):
         return total
 
     def compute_gravity_force(self, q: Array) -> Array:
-        """Compute the gravity force -m g l sin q of equation (1), (L, 1).
+        """Compute the gravity force -m g l sin q of equation (1), N m, (L, 1).
+
+        The mass m is at the distance l from the joint.
 
         Shapes: L batch elements.
 
@@ -299,7 +308,8 @@ class ServoDynamics(MachineDynamics):
     def compute_base_acceleration_force(self, q: Array) -> Array:
         """Compute the force m l cos q of a unit acceleration along x, (L, 1).
 
-        It is positive where a mass at positive q is on the right.
+        The mass m is at the distance l from the joint. The force is positive where a mass at
+        positive q is on the right.
 
         Shapes: L batch elements.
 
@@ -343,6 +353,7 @@ class ArmDynamics(MachineDynamics):
             n["inertia1"] + n["mass1"] * n["centre1"] ** 2 + n["mass2"] * n["length"] ** 2
         )
         inertia = np.empty((len(q), 2, 2))
+        # `added` is the rotor inertia of a hidden cause, at either joint.
         inertia[:, 0, 0] = (
             inner_inertia + outer_inertia + 2 * coupling + n["armature1"] + self.added[0]
         )
@@ -355,7 +366,10 @@ class ArmDynamics(MachineDynamics):
 
         They are the right-hand side of equation (4),
 
-            u - damping q' - g(q) + m2 l c2 sin q2 (2 q1' q2' + q2'^2, -q1'^2).
+            u - damping q' - g(q) + m2 l c2 sin q2 (2 q1' q2' + q2'^2, -q1'^2),
+
+        with the mass m2 of the second link, the distance c2 of its centre of mass from its joint,
+        and the length l of the first link.
 
         Shapes: L batch elements.
 

@@ -150,7 +150,8 @@ class _ResidualGauge:
 
         All simulations are one batch of R runs times 1 + P + 2 N variants: unchanged, each of P
         parameters, each of N angles and each of N velocities. A parameter changes all runs, an
-        initial state only its own run.
+        initial state only its own run. `bare` are the unchanged readings, and `_basis` is an
+        orthonormal basis of the changes.
 
         Args:
             conditions: recording conditions; only the runs for fitting are used.

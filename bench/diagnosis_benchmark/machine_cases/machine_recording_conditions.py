@@ -250,6 +250,9 @@ def _draw_runs(
         times: sample times, s, (T,).
         count: number of runs.
         rng: random generator.
+
+    Returns:
+        The runs, which begin at rest at angles within 0.4 rad.
     """
     signal_form = str(rng.choice(["steps", "sine", "chirp"]))
     joints = len(plant.joints)
@@ -259,7 +262,7 @@ def _draw_runs(
             for _ in range(count)
         ]
     )
-    commands = np.moveaxis(signals, 1, 2)
+    commands = np.moveaxis(signals, 1, 2)  # (runs, T, joints)
     # Angles in rad.
     initial_positions = rng.uniform(-0.4, 0.4, (count, joints))
     probe_positions = 0.4 * np.ones((1, joints))

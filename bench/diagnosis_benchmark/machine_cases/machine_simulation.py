@@ -127,7 +127,7 @@ class _MachineIntegrator:
             h: length of the step, s.
             u: mean applied input over the step, (L, N).
         """
-        if self.dry:
+        if self.dry:  # some joint has dry friction
             self._update_stuck_joints(t, u)
         q, v = self.q, self.v
         a1 = self._compute_accelerations(t, q, v, u)

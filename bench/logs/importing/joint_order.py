@@ -465,6 +465,7 @@ def _prefer_model(
         return {}
     _reorder(signals.channels, servos.channels, preferred.order, Placement.MODEL)
     _reorder(signals.inputs, servos.inputs, preferred.order, Placement.MODEL)
+    # Joints in the order of their columns in the log.
     columns = sorted(joints, key=lambda joint: preferred.order[joints.index(joint)])
     result.checks.append(
         "order of joints: the log does not name those of its columns; they are taken in the "

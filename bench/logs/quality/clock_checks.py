@@ -319,30 +319,34 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
         # Shortest time after which the values differ by as much as their spread.
         recorded_seconds = interval * _estimate_lag(values)
         ratio = recorded_seconds / expected_seconds
+        expected_text = f"as {kind.name} would within {expected_seconds:.2g} s"
         if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
-            moves = (
-                f"{name} moves in {recorded_seconds:.3g} s as {kind.name} would within "
-                f"{expected_seconds:.2g} s"
+            moves = f"{name} moves in {recorded_seconds:.3g} s {expected_text}"
+            anomaly = Anomaly(f"run {run.name}: {moves}; are the stamps seconds?", False)
+        else:
+            min_interval = (DRIVEN_SYSTEM_FACTOR if is_driven else 1.0) * expected_seconds
+            if ratio < TIME_UNIT_RATIO_THRESHOLD or interval < min_interval:
+                return None  # this coordinate shows that the time stamps are right
+            moves = f"{name} takes {recorded_seconds:.3g} s to move {expected_text}"
+            interval_text = f"samples lie {interval:.3g} s apart"
+            is_certain = not _has_inputs(run) or interval >= DRIVEN_SYSTEM_FACTOR * expected_seconds
+            anomaly = Anomaly(
+                f"run {run.name}: {moves}, and {interval_text}; {_recommend_time_unit(ratio)}",
+                is_certain,
             )
-            first_anomaly = first_anomaly or Anomaly(
-                f"run {run.name}: {moves}; are the stamps seconds?", False
-            )
-            continue
-        min_interval = (DRIVEN_SYSTEM_FACTOR if is_driven else 1.0) * expected_seconds
-        if ratio < TIME_UNIT_RATIO_THRESHOLD or interval < min_interval:
-            return None
-        divisor = min(_TIME_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
-        moves = (
-            f"{name} takes {recorded_seconds:.3g} s to move as {kind.name} would within "
-            f"{expected_seconds:.2g} s"
-        )
-        interval_text = f"samples lie {interval:.3g} s apart"
-        remedy = f"are the stamps {_TIME_UNITS[divisor]}? then divide t by {divisor:g}"
-        is_certain = not _has_inputs(run) or interval >= DRIVEN_SYSTEM_FACTOR * expected_seconds
-        first_anomaly = first_anomaly or Anomaly(
-            f"run {run.name}: {moves}, and {interval_text}; {remedy}", is_certain
-        )
+        first_anomaly = first_anomaly or anomaly
     return first_anomaly
+
+
+def _recommend_time_unit(ratio: float) -> str:
+    """Return the advice for time stamps that are too large by a factor: the unit that explains it.
+
+    Args:
+        ratio: recorded over expected time of a motion.
+    """
+    # The unit whose number in a second is closest to the factor, as a ratio.
+    divisor = min(_TIME_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
+    return f"are the stamps {_TIME_UNITS[divisor]}? then divide t by {divisor:g}"
 
 
 def _compute_free_motion_time(
@@ -542,6 +546,7 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     is_recorded = np.isfinite(y)
     if is_recorded.sum() < 2 * len(LAG_BIN_EDGES) or not (np.nanstd(y) > 0 and np.std(u) > 0):
         return
+    # An even grid with the usual interval, or a longer one if the run has very many samples.
     step = max(float(np.median(np.diff(t))), float(t[-1] - t[0]) / MAX_COMPARED_INSTANTS)
     grid = np.arange(t[0], t[-1], step)
     positions = np.interp(grid, t[is_recorded], y[is_recorded])
@@ -593,11 +598,9 @@ def _fit_drift(
     block_sums = np.add.reduceat(
         delay_response * residual, np.arange(0, time.size, LAG_BIN_EDGES[-1])
     )
-    error = (
-        STUDENT_T_FACTORS[min(len(block_sums), len(STUDENT_T_FACTORS) - 1)]
-        * float(np.sqrt(block_sums @ block_sums))
-        / response_power
-    )
+    # The error from few blocks is too small by this factor.
+    student_factor = STUDENT_T_FACTORS[min(len(block_sums), len(STUDENT_T_FACTORS) - 1)]
+    error = student_factor * float(np.sqrt(block_sums @ block_sums)) / response_power
     # The truncation of (2) adds an error in proportion to the drift.
     return _Estimate(drift, float(np.hypot(error, MODEL_ERROR_SHARE * drift)))
 

@@ -35,6 +35,8 @@ DELAY_THRESHOLD_INTERVALS = 0.5
 """Smallest reported lag T of equation (2), in sampling intervals."""
 MIN_SEGMENT_SAMPLES = 5
 """Minimum number of samples in an interval of integration."""
+MAX_SEGMENT_SAMPLES = 50
+"""Maximum number of samples in an interval of integration."""
 MIN_SEGMENTS = 10
 """Minimum number of intervals of integration."""
 MIN_RMS_CHANGE_SIGMAS = 3.0
@@ -136,8 +138,9 @@ class VelocityComparison(NamedTuple):
         # Samples of an interval: enough to exceed the noise, but not more, since over a whole
         # oscillation both the change and the integral vanish.
         required_length = np.ceil(MIN_POSITION_CHANGE_SIGMAS * sigma / rms_sample_change)
-        length = int(np.clip(required_length, MIN_SEGMENT_SAMPLES, 50))
+        length = int(np.clip(required_length, MIN_SEGMENT_SAMPLES, MAX_SEGMENT_SAMPLES))
         integrated = [part.integrate(length, MAX_INTERVAL_RATIO * interval) for part in series]
+        # Changes of the position, integrals of the velocity, and changes of the velocity.
         dq, s, dv = (np.concatenate(arrays) for arrays in zip(*integrated, strict=True))
         is_known = np.isfinite(s)  # no gap in time
         dq, s, dv = dq[is_known], s[is_known], dv[is_known]
@@ -193,6 +196,7 @@ class VelocityComparison(NamedTuple):
         power = slope * float(dv @ dv)
         if power == 0:
             return None
+        # T by least squares: the difference is about -slope T dv.
         seconds = -float(difference @ dv) / power
         residual = difference + slope * seconds * dv
         error = float(np.sqrt(residual @ residual / max(residual.size - 1, 1) / abs(slope * power)))
