@@ -185,6 +185,7 @@ def _build_error_rows(
     stored = read_comparison(folder)
     rows = RunRowTable(stored.runs, stored.statuses, stored.experiment.budget)
     frame = rows.keys[["tuner", "target"]].copy()
+    # The last column of a curve is its value after the whole budget.
     for parameter, width in zip(parameters, widths, strict=True):
         column_names = (f"recommendation_{parameter.name}", f"true_{parameter.name}")
         recommended, true = (rows.build_curves(column).values[:, -1] for column in column_names)
@@ -235,6 +236,7 @@ def build_score_table(scores: StudyScores) -> pd.DataFrame:
         )
         for metric, parameter, unit, column in metrics:
             values = group_errors[column].to_numpy(dtype=np.float64)
+            # A matrix of one column, because the bootstrap resamples the rows of a matrix.
             values = values[np.isfinite(values)][:, None]
             names = (scores.experiment.name, str(model), str(tuner))
             low, high = compute_bootstrap_interval(

@@ -114,8 +114,8 @@ def apply_input_effects(
     A lag must follow the nonlinear input effects; its exponential approach is left to the caller.
 
     Args:
-        levels: command at each sample.
-        edges: time of each sample, s.
+        levels: command at each of N samples, (N,).
+        edges: time of each sample, s, (N,).
         effects: coefficients of the hidden effects by name.
 
     Returns:

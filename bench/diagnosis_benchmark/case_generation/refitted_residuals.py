@@ -86,6 +86,7 @@ class NuisanceFitter:
         self.sigma = setting.noise_sigmas
         self.states = list(kind.states)
         true_values = [setting.parameters[p.name] for p in kind.system.parameters]
+        # The simulator's parameters are the base parameters, then the coefficients of the effects.
         self.theta = np.array(
             [*true_values, *(p.nominal for p in self.simulator.parameters[len(true_values) :])]
         )
@@ -345,7 +346,7 @@ def compute_smallest_residual(setting: RecordingConditions, observed: Array) -> 
         for name in usable
         if setting.is_driven or not (name.startswith("input.") or name == "backlash")
     ]
-    # By effect, the first-order residual of its best start, and the start.
+    # By effect, the first-order residual of its best start, and that start (theta).
     best_starts = {name: _rank_starts(setting, observed, name, base_fit)[0] for name in names}
     promising_names = sorted(names, key=lambda name: best_starts[name][0])[:MAX_REFITTED_EFFECTS]
     # An effect can be zero, so it never leaves more than the model without it.

@@ -100,7 +100,8 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
             is_touching = data.contact.dist[: data.ncon] <= 0.0
             touching_geoms = data.contact.geom[: data.ncon][is_touching]
             counts.update({(int(min(pair)), int(max(pair))) for pair in touching_geoms})
-    # Kinematic trees (bodies connected by joints) in which some joint is recorded.
+    # Kinematic trees (bodies connected by joints) in which some joint is recorded. The index of a
+    # joint's velocity is that of its degree of freedom.
     recorded_trees = {
         int(model.dof_treeid[joint.velocity])
         for run in recording.training()
@@ -185,6 +186,7 @@ def iterate_poses(
     with capture_mujoco_warnings():
         for sample in samples:
             mujoco.mj_resetData(model, data)
+            # `position`, `velocity` and `control` are indices into MuJoCo's arrays.
             for joint in joints:
                 values = positions.get(f"q.{joint.name}")
                 if values is not None and np.isfinite(values[sample]):
