@@ -156,6 +156,7 @@ class BounceShotStudy(Study):
         """
         check_shots(self.folder, self.shots)
         missing = {setup.name for setup in list_missing_shots(self.folder, self.shots)}
+        # Shots are counted by kind of ball.
         return [
             RunEnd(setup.name, setup.ball.name, MISSING_STATUS if setup.name in missing else "made")
             for setup in self.shots

@@ -282,7 +282,7 @@ def _interpolate_positions(rows: Array, times: Array) -> Array:
     """Interpolate positions (T, 3) at the sample times by cubic Hermite splines between steps.
 
     Args:
-        rows: Time, position and velocity after each step (S, 7).
+        rows: Time, position and velocity after each of S steps (S, 7).
         times: (T,) sample times, s.
     """
     from scipy.interpolate import CubicHermiteSpline

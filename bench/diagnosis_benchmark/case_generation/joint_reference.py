@@ -136,6 +136,9 @@ class JointDynamics:
     def compute_force(self, t: float, x: float, v: float, *z: float) -> float:
         """Compute the force on the coordinate, without dry friction, in N or N·m.
 
+        It is the sum of the applied input, gravity, the laws of the effects, and the reactions of
+        driven loads and hysteresis.
+
         Args:
             t: time.
             x: position.
@@ -273,6 +276,8 @@ class FlexibleReferenceLoad(ReferenceLoad):
 
     def compute_load_acceleration(self, x: float, v: float, y: float, w: float) -> float:
         """Compute the acceleration of the load by spring and damper; see `ReferenceLoad`.
+
+        With the natural frequency f and the damping ratio d, it is f^2 (x - y) + 2 d f (v - w).
 
         Args:
             x: position of the drive side, rad or m.

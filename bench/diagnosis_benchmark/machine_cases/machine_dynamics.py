@@ -224,6 +224,7 @@ class MachineDynamics(ABC):
             body: index of the body.
             factor: the factor.
         """
+        # The names of the parameters count bodies from 1.
         for name in (f"mass{body + 1}", f"inertia{body + 1}"):
             self.numbers[name] = factor * self.numbers[name]
 
@@ -395,6 +396,9 @@ class ArmDynamics(MachineDynamics):
 
     def _compute_mass_moment(self, function: Callable[[Array], Array], q: Array) -> Array:
         """Sum mass times lever arm of both links for each joint, as in equation (5), kg m, (L, N).
+
+        A lever arm is a length along a link times the sine or cosine of its angle. The second link
+        has the angle q1 + q2.
 
         Shapes: L batch elements, N joints.
 

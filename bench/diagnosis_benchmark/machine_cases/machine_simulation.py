@@ -101,6 +101,9 @@ class _MachineIntegrator:
     def __init__(self, plant: MachineDynamics, q: Array, v: Array) -> None:
         """Start at given positions and velocities.
 
+        `dry` tells whether any joint has dry friction. The first step decides which joints are
+        stuck (`held`) and in which direction the others slide.
+
         Shapes: L runs, N joints.
 
         Args:

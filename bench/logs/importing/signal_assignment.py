@@ -244,7 +244,7 @@ class _Candidate(NamedTuple):
 
     @property
     def kind(self) -> tuple[str, ...]:
-        """File and words of the column's name, without those of its joint and without numbers.
+        """File, kind of joint, and words of the column's name without its joint and numbers.
 
         Columns of one kind, such as `q_hip` and `q_knee`, are assigned together.
         """

@@ -579,7 +579,7 @@ def _fit_drift(
     Args:
         time: (N,) times of the N samples about their mean, s.
         positions: (N,) recorded positions.
-        regressors: (N, K) columns by which the commands explain the position, equation (1).
+        regressors: (N, K) K columns by which the commands explain the position, equation (1).
         velocity: (N,) velocity p' that the commands predict.
 
     Returns:
