@@ -80,9 +80,11 @@ class ActivationFilter(NamedTuple):
         Returns:
             (n, S + 1) activations; the last one is after the last step.
         """
+        # A model file may state a time constant of zero, which MuJoCo replaces by this minimum.
         ratio = step / max(self.seconds, MIN_TIME_CONSTANT)
+        # Share of the activation a[k] that remains after a step: 1 - h / T, or exp(-h / T).
         retained_share = float(np.exp(-ratio)) if self.exact or is_rk4 else 1.0 - ratio
-        # The recursion a[k+1] = decay a[k] + (1 - decay) u[k].
+        # The recursion a[k+1] = decay a[k] + (1 - decay) u[k] gives a after each step, (n, S).
         inputs = self.clip_controls(controls)
         decay = np.full_like(inputs, retained_share)
         end_activations = run_recursion(LINEAR, decay, (1.0 - decay) * inputs, initial[:, None])
@@ -105,11 +107,12 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
     import mujoco
 
     model = robot.compiled
-    filterexact_id = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    filter_types, exact_type = filters(), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
     activation_filters_of_robot = []
     for actuator in robot.actuators:
-        actuator_id = actuator.id
-        if int(model.actuator_dyntype[actuator_id]) not in filters() or actuator.controls != 1:
+        actuator_id, has_one_control = actuator.id, actuator.controls == 1
+        dynamics_type = int(model.actuator_dyntype[actuator_id])
+        if dynamics_type not in filter_types or not has_one_control:
             continue
         is_limited = bool(model.actuator_actlimited[actuator_id])
         low, high = model.actuator_actrange[actuator_id] if is_limited else (-np.inf, np.inf)
@@ -117,8 +120,9 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
             ActivationFilter(
                 actuator=actuator,
                 address=int(model.actuator_actadr[actuator_id]),
+                # The first parameter of a filter is its time constant.
                 seconds=float(model.actuator_dynprm[actuator_id, 0]),
-                exact=int(model.actuator_dyntype[actuator_id]) == filterexact_id,
+                exact=dynamics_type == exact_type,
                 limits=(float(low), float(high)),
             )
         )
@@ -126,27 +130,32 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
 
 
 def select_initial_activations(robot: RobotModel, initial: Mapping[str, float]) -> dict[str, float]:
-    """Return the activations among the initial states of a run, by name.
+    """Return the activations (outputs of filters before actuators) among a run's initial states.
 
     Args:
         robot: robot with the filters.
-        initial: initial states of the run, by name.
+        initial: initial states of the run by name; activations are named ``act.`` and actuator.
     """
-    names = {one.state for one in activation_filters(robot)}
-    return {name: value for name, value in initial.items() if name in names}
+    activation_names = {one_filter.state for one_filter in activation_filters(robot)}
+    return {name: value for name, value in initial.items() if name in activation_names}
 
 
 def compute_settling_time(robot: RobotModel, initial: Mapping[str, float]) -> float:
     """Return the time in seconds after which no filter depends on its initial activation.
 
-    Filters whose initial activation is specified are ignored.
+    Filters whose initial activation is specified are ignored. The slowest of the others decides:
+    the time is `SETTLING_TIME_CONSTANTS` times its time constant, or zero without such filters.
 
     Args:
-        robot: robot with the filters.
+        robot: robot with the filters before its actuators.
         initial: initial states of the run, by name.
     """
-    unknown = [one for one in activation_filters(robot) if one.state not in initial]
-    return SETTLING_TIME_CONSTANTS * max((one.seconds for one in unknown), default=0.0)
+    unknown_filters = [
+        one_filter for one_filter in activation_filters(robot) if one_filter.state not in initial
+    ]
+    return SETTLING_TIME_CONSTANTS * max(
+        (one_filter.seconds for one_filter in unknown_filters), default=0.0
+    )
 
 
 def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | None:
@@ -166,9 +175,10 @@ def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | 
         inputs before the run are not known for at least one step.
     """
     known_inputs = [scenario.before[name] for name in scenario.inputs if name in scenario.before]
+    # Times of the first known input: negative and increasing, so the first one is the earliest.
     earlier_times = next((times for times, _ in known_inputs), np.empty(0))
     steps = int(np.floor(-earlier_times[0] / step)) if earlier_times.size else 0
-    # The inputs of one run must be known at equal times.
+    # A scenario has one array of times for all of its inputs.
     have_equal_times = all(np.array_equal(times, earlier_times) for times, _ in known_inputs)
     if steps < 1 or len(known_inputs) < len(scenario.inputs) or not have_equal_times:
         return None
@@ -188,4 +198,5 @@ def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | 
         else:
             initial = float(earlier_values[np.flatnonzero(earlier_times <= start_time)[-1]])
         inputs[name] = np.concatenate([[initial], earlier_values[is_included], values])
+    # The history (`before`) is part of the inputs here. Switches (`off`) are known in the run only.
     return replace(scenario, times=times - start_time, inputs=inputs, before={}, off={}), steps

@@ -44,7 +44,11 @@ def is_model_field_effect(effect: Effect) -> bool:
 
 
 def changes_derived_constants(effect: Effect) -> bool:
-    """Return whether MuJoCo derives constants from the model fields that the effect changes."""
+    """Return whether MuJoCo derives constants from the model fields that the effect changes.
+
+    An example is a mass, from which MuJoCo derives inverse weights of bodies and joints. An effect
+    at one place has the name of the registered effect in `of`.
+    """
     return is_model_field_effect(effect) and (
         is_series_effect(effect)
         or MODEL_FIELD_EFFECTS[effect.of or effect.name].changes_derived_constants
@@ -101,14 +105,20 @@ class StepEffects(NamedTuple):
     def with_coefficients(self, rows: Any) -> StepEffects:
         """Return the effects with other coefficients.
 
+        The groups (forces, frictions, hidden) and the order of the effects are those of this
+        object.
+
         Args:
-            rows: (L, K) coefficients of all effects for L batch elements, in the order of
-                `coefficients`.
+            rows: (L, K) K coefficients of all effects together for L batch elements, in the order
+                of `coefficients`.
         """
+        # Columns after the last coefficient of each effect.
         ends = np.cumsum([len(effect.coefficients) for group in self for effect, _ in group])
-        parts = iter(np.split(rows, ends[:-1], axis=1))
+        columns_of_effects = iter(np.split(rows, ends[:-1], axis=1))
         groups: Any = (
-            tuple((effect, next(parts).T[:, :, None]) for effect, _ in group) for group in self
+            # An effect has coefficients of the shape (its number, L, 1).
+            tuple((effect, next(columns_of_effects).T[:, :, None]) for effect, _ in group)
+            for group in self
         )
         return StepEffects(*groups)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from sims.core.effect import ActiveEffects, Effect
 from sims.robot.contact_pairs import add_contact_pairs
 from sims.robot.coupled_drives import (
@@ -50,16 +48,17 @@ def group_by_added_elements(acting: ActiveEffects, count: int) -> dict[AddedElem
     Returns:
         Indices of the batch elements of each group, by the elements to add to the model.
     """
-    # Elements that an effect adds, and in which batch elements (L,) the effect is active. An effect
-    # in series with a joint is off where its first coefficient is not above zero.
-    additions = [
-        (added, np.where(is_series_effect(e), c[0] > 0, c.any(axis=0))[:, 0])
-        for e, c in acting
-        if (added := list_added_elements(e))
-    ]
+    # Model elements that an effect adds, and in which batch elements (L,) the effect is active.
+    additions = []
+    for effect, c in acting:
+        added = list_added_elements(effect)
+        if added:
+            # An effect in series with a joint is off where its first coefficient is not above zero.
+            is_active = c[0] > 0 if is_series_effect(effect) else c.any(axis=0)
+            additions.append((added, is_active[:, 0]))
     groups: dict[AddedElements, list[int]] = {}
     for batch_index in range(count):
-        # Several effects may add one element, which counts once.
+        # Several effects may add one element, which counts once. A dict keeps the order.
         elements = dict.fromkeys(
             element for added, is_active in additions if is_active[batch_index] for element in added
         )
@@ -68,17 +67,20 @@ def group_by_added_elements(acting: ActiveEffects, count: int) -> dict[AddedElem
 
 
 def add_elements(robot: RobotModel, added: AddedElements) -> RobotModel:
-    """Add pairs of geoms, tendons of coupled drives and joints in series to a robot.
+    """Add the model elements that effects need: contact pairs, coupling tendons, joints in series.
 
-    They change no motion until effects write their numbers. Names of elements do not change.
+    The numbers of these elements are neutral, so that no motion changes until effects write them
+    for each batch element. Existing names do not change.
 
     Args:
         robot: robot as read from its model file.
-        added: the elements as pairs of place and effect (or a placeholder); with none of them, the
-            robot itself is returned.
+        added: the elements as pairs of place and effect: (contact, `CONTACT_PAIR`),
+            (joint, effect in series), or `COUPLING_PLACEHOLDER` for the tendons of all coupled
+            drives. With none of them, the robot itself is returned.
     """
     robot = add_contact_pairs(robot, [place for place, effect in added if effect == CONTACT_PAIR])
     if COUPLING_PLACEHOLDER in added:
+        # With a coupling of zero a drive moves its own joint only.
         robot = make_coupled_robot(robot, dict.fromkeys(list_coupling_places(robot), 0.0))
     series: SeriesJoints = tuple(
         (place, effect) for place, effect in added if effect not in (CONTACT_PAIR, COUPLING_EFFECT)
@@ -88,7 +90,7 @@ def add_elements(robot: RobotModel, added: AddedElements) -> RobotModel:
 
 @cache_per_robot
 def find_compile_error(robot: RobotModel, added: AddedElements) -> str:
-    """Return why the model with added elements does not compile; empty if it does.
+    """Return MuJoCo's reason why the model with added elements does not compile; empty if it does.
 
     The model is compiled without shapes, which takes little time.
 
@@ -97,6 +99,7 @@ def find_compile_error(robot: RobotModel, added: AddedElements) -> str:
         added: joints in series and tendons, as pairs of place and effect.
     """
     try:
+        # The model is compiled when this property is first read.
         add_elements(strip_shapes(robot), added).compiled  # noqa: B018
     # MuJoCo raises several kinds of errors, and an effect of a user's plugin may raise any.
     except Exception as error:

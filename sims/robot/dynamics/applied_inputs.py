@@ -108,9 +108,8 @@ class RunInputs(NamedTuple):
             return np.array([share, 1.0])
         # If commands change only at step ends, the mean describes each step completely.
         sample_times = self._get_sample_times_in_steps(step)
-        is_aligned = bool(
-            (np.abs(sample_times - np.rint(sample_times)) < STEP_COUNT_TOLERANCE).all()
-        )
+        distances_from_step_end = np.abs(sample_times - np.rint(sample_times))
+        is_aligned = bool((distances_from_step_end < STEP_COUNT_TOLERANCE).all())
         return NO_SUBDIVISION if is_aligned and not is_changed else STEP_SUBDIVISION
 
     def find_steps_with_sample(self, step: float) -> Mask:
@@ -181,12 +180,20 @@ def compute_inputs_over_steps(
             earlier,
             _compute_signal_digest(scenario.times, signal),
         )
-        # One batch element without effects stands for all.
-        request = _InputRequest(0, scenario, name, signal, np.zeros(1, dtype=np.intp), ())
+        # One batch element without effects, (1, S), stands for all.
+        request = _InputRequest(
+            run=0,
+            scenario=scenario,
+            name=name,
+            signal=signal,
+            batch_indices=np.zeros(1, dtype=np.intp),
+            acting=(),
+        )
         unchanged = _applied_input_cache.get(
             key, partial(_compute_applied_inputs, step, [request], steps, has_sample, fractions)
         )
         applied_inputs[name] = np.repeat(unchanged, n, axis=0)
+    # The inputs of batch elements with input effects.
     for _, name, batch_indices, values in compute_changed_inputs(step, [run], share):
         applied_inputs[name][batch_indices] = values
     return applied_inputs
@@ -205,13 +212,15 @@ def compute_changed_inputs(
     Args:
         step: step length in seconds.
         runs: the runs.
-        share: as in `compute_inputs_over_steps`.
+        share: share of each step, from its beginning, over which the input is averaged.
 
     Yields:
         Number of the run, name of the input, indices of some of the run's batch elements (L,), and
         their applied inputs (L, S) over S steps.
     """
     # 1. Collect one request for each input and group of batch elements with the same effects on it.
+    # They are grouped by the steps, their division, and the steps with a sample; arrays are stored
+    # as bytes, so that they can be keys.
     requests_by_grid: dict[tuple[int, bytes, bytes], list[_InputRequest]] = {}
     for run_index, run in enumerate(runs):
         fractions = run.get_step_fractions(step, share, is_changed=True)
@@ -226,10 +235,10 @@ def compute_changed_inputs(
             # Each element is evaluated with its own effects only, so that its value does not depend
             # on other elements.
             requests += [
-                _InputRequest(run_index, run.scenario, name, signal, *part)
-                for part in _group_by_active_effects(input_effects, run.n)
+                _InputRequest(run_index, run.scenario, name, signal, batch_indices, acting)
+                for batch_indices, acting in _group_by_active_effects(input_effects, run.n)
             ]
-    # 2. Evaluate the requests, and divide the results again.
+    # 2. Evaluate the requests of a group in one batch, and divide the rows of the result again.
     for (steps, fraction_bytes, sample_bytes), requests in requests_by_grid.items():
         fractions = np.frombuffer(fraction_bytes)
         has_sample = np.frombuffer(sample_bytes, dtype=bool)
@@ -261,10 +270,14 @@ class _InputRequest(NamedTuple):
 
 
 def _restrict_to_input(scenario: Scenario, name: str) -> Scenario:
-    """Restrict a scenario to the interpolation and the history of one input.
+    """Restrict a scenario to the interpolation (`linear`) and the history (`before`) of one input.
 
-    It gets the name `SINGLE_INPUT_NAME`, so that inputs of several names are computed in one batch.
-    Its commands are passed separately.
+    The input gets the name `SINGLE_INPUT_NAME`, so that inputs of several names are computed in one
+    batch. Its commands are passed separately, so the scenario has no inputs.
+
+    Args:
+        scenario: scenario of a run.
+        name: name of the input in this scenario.
     """
     return replace(
         scenario,
@@ -312,9 +325,9 @@ def _group_requests(requests: Sequence[_InputRequest]) -> Iterator[list[_InputRe
     """
     requests_by_effects: dict[tuple[str, ...], list[_InputRequest]] = {}
     for request in requests:
-        requests_by_effects.setdefault(tuple(e.of or e.name for e, _ in request.acting), []).append(
-            request
-        )
+        # Names of the registered effects, which are equal at all places.
+        effect_types = tuple(e.of or e.name for e, _ in request.acting)
+        requests_by_effects.setdefault(effect_types, []).append(request)
     for group in requests_by_effects.values():
         # A request belongs to the part in which its last element lies.
         ends = np.cumsum([request.batch_indices.size for request in group])
@@ -339,10 +352,11 @@ def _compute_applied_inputs(
 ) -> Array:
     """Compute the input that each request applies over each step, (N, S) for N batch elements.
 
-    The requests are integrated as one batch on a time grid that divides each step at `fractions`,
-    because delays and filters act within a step. Quarters (`STEP_SUBDIVISION`) are then combined to
-    one value per step. With fewer parts, the value of the first part is returned: it is the whole
-    step, or the beginning of the step that was asked for.
+    A request has the commands of one input and the effects on it. The requests are integrated as
+    one batch on a time grid that divides each step at `fractions`, because delays and filters act
+    within a step. Quarters (`STEP_SUBDIVISION`) are then combined to one value per step. With fewer
+    parts, the value of the first part is returned: it is the whole step, or the beginning of the
+    step that was asked for.
 
     Args:
         step: step length in seconds.
@@ -353,19 +367,22 @@ def _compute_applied_inputs(
         fractions: ends of the parts of a step, as shares of its length.
     """
     acting = _concatenate_effects(requests)
-    run_of_element = np.repeat(
-        np.arange(len(requests)), [request.batch_indices.size for request in requests]
-    )
+    # Each request is treated as a run with one input; a request may have several batch elements.
+    sizes = [request.batch_indices.size for request in requests]
+    request_of_element = np.repeat(np.arange(len(requests)), sizes)
+    element_count = request_of_element.size
     runs = ScenarioGroups(
         tuple(_restrict_to_input(request.scenario, request.name) for request in requests),
-        run_of_element,
+        request_of_element,
     )
-    plan = _make_subdivided_grid(
-        step, steps, run_of_element.size, fractions, has_uniform_steps=not acting
+    # Without effects, which may shift the times of each element differently, a request is evaluated
+    # once for all of its elements.
+    time_grid = _make_subdivided_grid(
+        step, steps, element_count, fractions, has_uniform_steps=not acting
     )
     commands = [{SINGLE_INPUT_NAME: request.signal} for request in requests]
-    values = compute_applied_inputs(plan, runs, commands, acting)[SINGLE_INPUT_NAME]
-    parts = values.reshape(run_of_element.size, steps, fractions.size)
+    values = compute_applied_inputs(time_grid, runs, commands, acting)[SINGLE_INPUT_NAME]
+    parts = values.reshape(element_count, steps, fractions.size)
     if fractions.size < STEP_SUBDIVISION.size:
         return parts[:, :, 0]
     return compute_step_inputs(parts, has_sample)
@@ -379,17 +396,22 @@ def _make_subdivided_grid(
     Args:
         step: step length in seconds.
         steps: number of steps.
-        n: number of batch elements.
+        n: number of batch elements, which all have the same steps.
         fractions: ends of the parts of a step, as shares of its length.
-        has_uniform_steps: whether all parts are declared to have equal length.
+        has_uniform_steps: whether inputs may be computed once for all batch elements with the same
+            scenario.
     """
     begins: Array = step * np.arange(float(steps))
     ends = (begins[:, None] + step * fractions).ravel()
     lengths = np.diff(ends, prepend=0.0)
-    rows = np.zeros((n, 1), dtype=np.intp)
-    shape = n, ends.size
-    whole = np.broadcast_to(lengths, shape), np.broadcast_to(ends, shape)
-    return TimeGrid(*whole, 1, rows, has_uniform_steps=has_uniform_steps)
+    return TimeGrid(
+        steps=np.broadcast_to(lengths, (n, ends.size)),
+        ends=np.broadcast_to(ends, (n, ends.size)),
+        # No state is stored: the grid is used for inputs only.
+        steps_per_sample=1,
+        rows=np.zeros((n, 1), dtype=np.intp),
+        has_uniform_steps=has_uniform_steps,
+    )
 
 
 def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
@@ -399,7 +421,7 @@ def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
     be applied too early or too late by a fraction of it. The control has the command's mean. In
     addition, the first moment of the command about the middle of the step,
 
-        D = 1 / h^2 times the integral of (s - h / 2) u(s)                                 (1)
+        D = 1 / h^2 times the integral of (s - h / 2) u(s) over the step, s = 0 to h           (1)
 
     is reproduced by two neighbouring steps together. Between them the state is wrong, so no sample
     may be there:
@@ -416,7 +438,7 @@ def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
     """
     # Distances of the middles of the quarters from the middle of the step, in steps.
     distances = (np.arange(4.0) + 0.5) / 4.0 - 0.5
-    moments = parts @ (distances / 4.0)  # (1)
+    moments = parts @ (distances / 4.0)  # D of each step, (n, S)
     means: Array = parts @ np.full(4, 0.25)
     last = parts.shape[1] - 1
     # Direction of the step that shares the moment: 1 for the next one, -1 for the previous one.

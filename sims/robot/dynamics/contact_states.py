@@ -81,21 +81,23 @@ class _Contact(NamedTuple):
 
 
 class ContactModel:
-    """A robot at the first instant of a run, whose contacts are evaluated at given states.
-
-    A large gap (`SEARCH_GAP`) makes MuJoCo report geoms that only nearly touch, too.
-
-    Args:
-        simulator: simulator of the robot.
-        theta: (P,) parameters, of which effects have their coefficients.
-    """
+    """A robot at the first instant of a run, whose contacts are evaluated at given states."""
 
     def __init__(self, simulator: RobotSimulator, theta: Array) -> None:
+        """Copy the robot's MuJoCo model, with the active effects written into it.
+
+        A large gap (`SEARCH_GAP`) makes MuJoCo report geoms that only nearly touch, too.
+
+        Args:
+            simulator: simulator of the robot.
+            theta: (P,) parameters, of which effects have their coefficients.
+        """
         import mujoco
 
         self._simulator = simulator
         self._acting = simulator.get_active_effects(theta[None])
         mujoco_batch = simulator.make_linearisation_batch(self._acting)
+        # All elements of the batch get the same effects; the model of the first one is copied.
         mujoco_batch.write_effects(
             tuple(
                 (effect, np.repeat(c, mujoco_batch.count, axis=1))
@@ -107,7 +109,7 @@ class ContactModel:
         self._data = mujoco.MjData(self._model)
         self._map_forces = mujoco_batch.map_forces
         self._joints = mujoco_batch.file_joints
-        self._bodies: list[int] = self._model.geom_bodyid.tolist()
+        self._body_of_geom: list[int] = self._model.geom_bodyid.tolist()
 
     def begin_run(self, scenario: Scenario, x: Array, v: Array) -> None:
         """Set the inputs at the beginning of a run: first controls, forces and activations.
@@ -121,6 +123,7 @@ class ContactModel:
         """
         import mujoco
 
+        # The inputs of a batch of one element, over one step.
         commands = self._simulator.run_inputs(scenario)
         inputs = self._simulator.compute_controls(
             RobotRunBatch(scenario, commands, self._acting, x[None], v[None]), 1
@@ -133,12 +136,14 @@ class ContactModel:
     def evaluate(self, state: Array) -> dict[_Key, _Contact]:
         """Return all contacts at a state (2 D,): positions, then velocities of the D joints.
 
-        The derivative of a contact point's velocity, du/dt = J a + (dJ/dt) v, needs the change of
-        its Jacobian J with time. It is the difference to the Jacobian after the robot has moved by
-        one time step; a contact that no longer exists there counts as unchanged.
+        With the Jacobian J of a contact point, its velocity is u = J v and its acceleration is
+        du/dt = J a + (dJ/dt) v, for velocities v and accelerations a of the robot. The change of J
+        with time is the difference to the Jacobian after the robot has moved by one time step; a
+        contact that no longer exists there counts as unchanged.
 
         Returns:
-            The contacts by their two geoms and a number.
+            The contacts by their two geoms and a number, which distinguishes contacts of the same
+            geoms.
         """
         import mujoco
 
@@ -156,7 +161,7 @@ class ContactModel:
         for key, (jacobian, distance, is_closed) in contacts.items():
             later_jacobian, *_ = contacts_after_step.get(key, (jacobian,))
             acceleration = jacobian @ a + (later_jacobian - jacobian) @ v / model.opt.timestep
-            normal = jacobian[0, joints.velocities]
+            normal = jacobian[0, joints.velocities]  # the first row is along the normal
             result[key] = _Contact(jacobian @ v, acceleration, distance, is_closed, normal)
         return result
 
@@ -180,11 +185,14 @@ class ContactModel:
         addresses = all_contacts.efc_address.tolist()
         last_numbers: dict[tuple[int, int], int] = {}
         for i, (first, second) in enumerate(all_contacts.geom.tolist()):
+            # Velocity of the contact point if it moves with the one or with the other geom.
             for jacobian, geom in zip(jacobians, (first, second), strict=True):
-                mujoco.mj_jac(model, data, jacobian, None, points[i], self._bodies[geom])
-            rows = 3 if dims[i] > 1 else 1
+                mujoco.mj_jac(model, data, jacobian, None, points[i], self._body_of_geom[geom])
             first_jacobian, second_jacobian = jacobians
-            relative = frames[i, :rows] @ (second_jacobian - first_jacobian)
+            # The rows of a frame are the normal and two tangents. MuJoCo's dimension 1 means a
+            # contact without friction.
+            directions = frames[i, : 3 if dims[i] > 1 else 1]
+            relative = directions @ (second_jacobian - first_jacobian)
             number = last_numbers[first, second] = last_numbers.get((first, second), -1) + 1
             # A contact without a force has no constraint, and so the address -1.
             contacts[first, second, number] = relative, distances[i], addresses[i] >= 0
@@ -213,7 +221,8 @@ def settle_contacts(
 
         |W (z - z_m)|^2 + |u_n / e_v|^2 + |(du/dt) / e_a|^2                                    (2)
 
-    with the velocity u of the contact points, its normal part u_n, and tolerances e. The steps are:
+    with the velocity u of the contact points, its normal part u_n, the tolerances e_v of a velocity
+    and e_a of an acceleration, and W^T W, the inverse of the covariance of z_m. The steps are:
 
     1. Select the contacts that may be closed: those whose distance could be a measurement error.
     2. Linearise them by finite differences, and solve for a Gauss-Newton step.
@@ -234,11 +243,12 @@ def settle_contacts(
     Returns:
         (D,) positions and velocities; the measured ones if no contact may be closed.
     """
-    measured = np.concatenate(start)
+    measured = np.concatenate(start)  # z_m
     if weights is None:
         weights = np.diag(1.0 / np.concatenate(sigma))
     with capture_mujoco_warnings():
-        # 1. Contacts that may be closed.
+        # 1. Contacts that may be closed. The standard deviation of a distance follows from those of
+        # the positions, by its derivatives along the normal.
         model.begin_run(scenario, *start)
         state, contacts = measured, model.evaluate(measured)
         keys = [
@@ -254,7 +264,7 @@ def settle_contacts(
             # The contacts are already in equilibrium.
             if cost <= SETTLED_COST * len(keys):
                 break
-            # 2. Gauss-Newton step.
+            # 2. Gauss-Newton step. The layout determines the rows of the derivatives.
             layout = tuple((key, contacts[key].is_closed) for key in keys)
             residual = _compute_residual(contacts, contacts, keys)
             # Without known derivatives, each iteration makes its own.
@@ -305,9 +315,11 @@ def _differentiate(
         keys: contacts that may be closed, which make up the residual.
     """
     jacobian = np.empty((residual.size, state.size))
+    # `DIFFERENCES` has one size for all positions, and one for all velocities.
     for i, difference in enumerate(np.repeat(DIFFERENCES, state.size // 2).tolist()):
         moved = state.copy()
         moved[i] += difference
+        # Which contacts are closed is that of the state itself, so that the rows are the same.
         changed = _compute_residual(model.evaluate(moved), contacts, keys)
         jacobian[:, i] = (changed - residual) / difference
     return jacobian
@@ -370,7 +382,9 @@ def _compute_cost(contacts: dict[_Key, _Contact], keys: list[_Key]) -> float:
     """
     if not all(key in contacts for key in keys):
         return float("inf")
+    # The same contacts decide here what is closed.
     residual = _compute_residual(contacts, contacts, keys)
     open_count = sum(not contacts[key].is_closed for key in keys)
-    falling = open_count * 9.81 / ACCELERATION_TOLERANCE  # acceleration of gravity in m/s^2
+    # An open contact falls with the acceleration of gravity, 9.81 m/s^2.
+    falling = open_count * 9.81 / ACCELERATION_TOLERANCE
     return float(residual @ residual + falling**2)

@@ -34,8 +34,9 @@ def compute_off_steps(robot: RobotModel, scenario: Scenario, step: float, steps:
     its middle.
 
     Args:
-        robot: robot whose actuators are meant.
-        scenario: run with its sample times and the actuators that are off at each sample.
+        robot: robot with K actuators.
+        scenario: run with T sample times; `off` has by actuator whether it is off, (T,), and
+            `offset` is the delay of inputs against their time stamps, in seconds.
         step: step length in seconds.
         steps: number S of steps.
 
@@ -47,6 +48,7 @@ def compute_off_steps(robot: RobotModel, scenario: Scenario, step: float, steps:
         return off_steps
     stamps = scenario.times - scenario.times[0] + scenario.offset
     middles = step * (np.arange(float(steps)) + SAMPLED_STEP_FRACTION)
+    # Index (S,) of the last sample before the middle of each step.
     sample_indices = np.clip(np.searchsorted(stamps, middles, side="right") - 1, 0, stamps.size - 1)
     for name, off in scenario.off.items():
         off_steps[:, robot.actuator(name).id] = off[sample_indices]

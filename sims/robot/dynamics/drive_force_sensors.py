@@ -57,29 +57,31 @@ class DriveSensorModel:
             readings: (n, S, k) sensor data of n batch elements in S steps; changed in place.
         """
         batch_inputs, mujoco_batch = self.inputs, self.batch
+        columns = mujoco_batch.drives  # column of the drive force in the sensor data, by joint
         batch_size = len(readings)
         for actuator in self.robot.actuators:
+            # Command at the beginning of a step minus its mean over the step; none while it is off.
             control_change = (
                 batch_inputs.instant[:, :, actuator.control]
                 - batch_inputs.controls[:, :, actuator.control]
             )
             control_change = np.where(batch_inputs.off[:, :, actuator.id], 0.0, control_change)
             # Without a driven joint no sensor shows the force.
-            if actuator.joint not in mujoco_batch.drives or not control_change.any():
+            if actuator.joint not in columns or not control_change.any():
                 continue
-            force = readings[:, :, mujoco_batch.drives[actuator.joint]]  # a view
+            force = readings[:, :, columns[actuator.joint]]  # a view
             force_before = force.copy()
             force += control_change * self._compute_force_per_control(actuator)[:batch_size, None]
             np.clip(force, *self._get_force_limits(actuator), out=force)
             if actuator.joint in mujoco_batch.robot.coupled:
                 preceding_joint = find_preceding_joint(self.robot, actuator.joint)
-                assert preceding_joint is not None
-                coupling_coefficients: Array = mujoco_batch.fields[COUPLING_FIELD][
+                assert preceding_joint is not None  # only such joints can be coupled
+                # Force on the preceding joint per unit of the drive's force, (n,).
+                coupling: Array = mujoco_batch.fields[COUPLING_FIELD][
                     :batch_size, get_coupling_address(mujoco_batch.robot, actuator.joint)
                 ]
-                readings[:, :, mujoco_batch.drives[preceding_joint.name]] += coupling_coefficients[
-                    :, None
-                ] * (force - force_before)
+                preceding_column = columns[preceding_joint.name]
+                readings[:, :, preceding_column] += coupling[:, None] * (force - force_before)
 
     def add_drive_effects(self, readings: Array, x: Array, v: Array, acting: ActiveEffects) -> None:
         """Add the forces of effects in the drives to the drive-force readings.
@@ -136,19 +138,20 @@ class DriveSensorModel:
         drive_readings += compute_drive_effect_forces(repeated, snapshot).reshape(
             drive_readings.shape
         )
+        # The indices are broadcast to (batch elements, steps, drives).
         readings[batch_indices[:, None, None], np.arange(steps)[:, None], columns] = drive_readings
 
     def _compute_force_per_control(self, actuator: Actuator) -> Array:
         """Return the joint force at once per unit of an actuator's control, (N,) in the batch.
 
         It is zero if a filter precedes the actuator, or if the force is not a gain times the
-        control.
+        control. Effects may change the gain, so that the N elements of the batch differ.
         """
         gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
         gain: Array = self.batch.fields["actuator_gainprm"][:, actuator.id, 0]
-        direct = actuator.kind in ("motor", "position", "velocity")
-        direct = direct and not self._is_filtered(actuator)
-        return gear * gain if direct else np.zeros_like(gain)
+        has_constant_gain = actuator.kind in ("motor", "position", "velocity")
+        acts_at_once = has_constant_gain and not self._is_filtered(actuator)
+        return gear * gain if acts_at_once else np.zeros_like(gain)
 
     def _is_filtered(self, actuator: Actuator) -> bool:
         """Return whether a filter precedes the actuator, so that controls act with a delay."""
@@ -161,6 +164,6 @@ class DriveSensorModel:
         """
         gear = abs(float(self.robot.compiled.actuator_gear[actuator.id, 0]))
         low, high = actuator.force or (-np.inf, np.inf)
-        assert actuator.joint is not None
+        assert actuator.joint is not None  # the caller skips actuators without a joint
         effort = self.robot.joint(actuator.joint).effort or np.inf
         return max(gear * low, -effort), min(gear * high, effort)

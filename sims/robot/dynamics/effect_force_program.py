@@ -122,23 +122,28 @@ class StepForces:
             for effect, c in group
         ]
         program = programs.find(function, sources) or make_numpy_program(function)
-        # 3. Registers.
+        # 3. Registers, one row for each number and one column for each batch element. Each group is
+        # a slice of rows. The motion has one group for each field of `JointStates`.
         self.prepared = PreparedProgram(program, len(stiffness))
-        self.registers = r = self.prepared.r
+        self.registers = registers = self.prepared.r
         groups = [slice(*ends) for ends in pairwise(function.input_ends)]
         self._t, self._midpoint_time, step_group, self._interval, *groups = groups
         *self._motion, self._u, self._stiffness_group, coefficient_group, self._states = groups
-        r[step_group] = step
-        r[self._stiffness_group] = stiffness.T
-        r[coefficient_group] = effects.coefficients
+        registers[step_group] = step
+        registers[self._stiffness_group] = stiffness.T
+        registers[coefficient_group] = effects.coefficients
+        # The first part of the program computes what stays constant; the second part is that of a
+        # step; robots have no third part, the impacts.
         prepare_elements, self._run, _ = self.prepared.make_runners()
         prepare_elements()
 
     def _make_test(self, effect: Effect, c: Array) -> tuple[ArrayFunction, Iterator[Array]]:
         """Return the array function of one effect, and random inputs at which to test its program.
 
-        A compiled program must agree with NumPy there (`TracedSource`). The random numbers have
-        different sizes and a fixed seed, so that the answer is the same in each process.
+        An array function computes the forces of the effect from groups of numbers, such as the
+        motion and the coefficients. A compiled program must agree with NumPy there
+        (`TracedSource`). The random numbers have different sizes and a fixed seed, so that the
+        answer is the same in each process.
 
         Args:
             effect: effect in the batch.
@@ -146,6 +151,7 @@ class StepForces:
         """
         effects = StepEffects.from_active(((effect, c),))
         function = _make_function(self._system, tuple(self._applied_inputs), effects)
+        # Rows of the inputs of each group.
         groups = [slice(*ends) for ends in pairwise(function.input_ends)]
 
         def make_samples() -> Iterator[Array]:
@@ -192,6 +198,7 @@ class StepForces:
         """
         if not self._hidden:
             return
+        # Inputs (L, 1) in the first step.
         inputs = {name: u[:, 0, None] for name, u in self._applied_inputs.items()}
         snapshot = make_snapshot(
             self._system,
@@ -212,7 +219,8 @@ class StepForces:
 
         MuJoCo holds forces over a step. Evaluated at the predicted middle, they have an error of
         second order only. Hidden states of effects advance to the same time. All L batch elements
-        and D joints are evaluated at once.
+        and D joints are evaluated at once. The inputs are written into the registers of the
+        program, which has a column for each batch element, and the results are read from there.
 
         Args:
             k: number of the step; must increase by one from call to call.
@@ -232,6 +240,7 @@ class StepForces:
         if k == 0:
             self.begin(joint_states)
         self._run()
+        # Numbers of the registers with the results; the hidden states begin the next step.
         ((force, limit, states),) = self.prepared.program.outputs
         registers[self._states] = registers[states]
         return registers[force].T, registers[limit].T
@@ -254,10 +263,11 @@ def _make_function(
     interval.
 
     Args:
-        system: system of the robot.
+        system: system of the robot, with D joints.
         input_names: names of the inputs.
         effects: the effects.
     """
+    # A hidden state has a position and a rate.
     joints, states = len(system.coordinates), 2 * len(effects.hidden)
 
     def bind(t: Any, middle: Any, step: Any, interval: Any, *values: Any) -> tuple[Evaluator]:
@@ -304,6 +314,7 @@ def _make_function(
 
         return (evaluate,)
 
+    # Sizes of the groups, and how often their values change: coefficients never do in a batch.
     sizes = [1] * 4 + [joints] * len(JointStates._fields) + [len(input_names), joints]
     groups = [(size, PER_EVALUATION) for size in sizes]
     groups += [(len(effects.coefficients), PER_ELEMENT), (states, PER_EVALUATION)]

@@ -67,14 +67,12 @@ def compute_time_dependent_forces(
         batch_size: number L of batch elements.
     """
     forces = np.zeros((batch_size, t.size, size))
-    half = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
-    # The state does not matter; each step is one element of the snapshot.
+    half_step = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
+    # The state does not matter; each step is one element of the snapshot. The force at the middle
+    # of a step gives the momentum of the force over the step, to second order.
     at_rest = np.zeros((t.size, size))
-    # The force at the middle of a step gives the momentum of the force over the step, to second
-    # order.
-    snapshots = make_snapshot(
-        system, (t + half)[:, None], at_rest, at_rest, {}, np.stack([at_rest] * 2)
-    )
+    no_loads = np.stack([at_rest] * 2)
+    snapshots = make_snapshot(system, (t + half_step)[:, None], at_rest, at_rest, {}, no_loads)
     for effect, c in acting:
         if effect.of not in TIME_DEPENDENT_EFFECTS or not isinstance(effect, Force):
             continue
@@ -87,11 +85,12 @@ def compute_time_dependent_forces(
 def compute_drive_effect_forces(acting: ActiveEffects, snapshot: RobotSnapshot) -> Array:
     """Compute the forces (L, D) that effects in drives, such as a voltage drop, add to the drives.
 
-    Effects that act elsewhere are ignored. Shapes: L batch elements, D joints, K coefficients.
+    Effects that act elsewhere are ignored. Shapes: L batch elements, D joints, K coefficients. The
+    unit is N or N m.
 
     Args:
         acting: effects with their coefficients (K, L, 1).
-        snapshot: state of the batch.
+        snapshot: state of the batch at which the effects are evaluated.
     """
     return compute_effect_forces(
         [(e, c) for e, c in acting if isinstance(e, Force) and is_in_drive(e)], snapshot
@@ -109,6 +108,7 @@ def compute_effect_forces(forces: Sequence[tuple[Force, Array]], snapshot: Robot
     """
     total = np.zeros_like(snapshot.x)
     for effect, c in forces:
+        # Not in place, since the values may be symbols of a program that is compiled.
         total = total + effect.force(c, snapshot)
     return total
 
@@ -129,7 +129,7 @@ def compute_friction_limits(
     limit = np.zeros_like(snapshot.x)
     for effect, c in frictions:
         joint = effect.coordinate
-        assert joint is not None
+        assert joint is not None  # dry friction always acts at a joint
         limit[:, joint] = limit[:, joint] + effect.limit(c, snapshot)[:, 0]
     return limit
 
@@ -163,7 +163,7 @@ def compute_hidden_state_forces(
     later_states = []
     for (effect, c), state in zip(hidden, states, strict=True):
         after = advance_state(effect, c, during, state, step)
-        force, _ = effect.act(c, end, after)
+        force, _ = effect.act(c, end, after)  # the rate of the state is not needed here
         total = total + np.where(c[0] > 0, force, 0.0)
         later_states.append(after)
     return total, later_states

@@ -91,7 +91,8 @@ def integrate_state(
         _, rate = effect.act(coefficients, snapshots, HiddenState(zero + x, zero + w))
         return rate
 
-    # A linear rate at the middle is the mean of both ends, whatever the position is.
+    # The rate is linear if that at w = 1/2 is the mean of those at 0 and 1. There the position is
+    # another one, on which the rate must not depend.
     rate_at_zero, rate_at_one = compute_rate(0.0, 0.0), compute_rate(1.0, 0.0)
     rate_at_half = compute_rate(0.5, 1.0)
     if np.allclose(
@@ -110,7 +111,8 @@ def _integrate_linear_state(state: HiddenState, change_at_zero: Array, z: Array)
     """Integrate a hidden state w whose rate r(w) = r(0) + w dr/dw is linear in each step.
 
     The step w + h phi(z) r(w), with phi(z) = (e^z - 1) / z and z = h dr/dw (1), is then the
-    recursion w <- e^z w + phi(z) h r(0). The position of the state stays constant.
+    recursion w <- e^z w + phi(z) h r(0). In `HiddenState`, w is the velocity v. The position x is
+    not integrated, since the rate does not depend on it; it keeps its initial value.
 
     Args:
         state: initial state, (1, 1).

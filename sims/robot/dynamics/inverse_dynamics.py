@@ -33,8 +33,10 @@ def motion_forces(
 ) -> MotionForces:
     """Compute the joint forces of a motion by inverse dynamics, and those of the actuators.
 
-    The difference of both is the force that the model lacks. The motion is given, so nothing is
-    integrated. Joints that are not in `joints` rest in the reference pose of the model.
+    Inverse dynamics gives the forces that the motion requires in addition to gravity and the
+    passive forces of the model. Their difference from the forces of the actuators is the force that
+    the model lacks. The motion is given, so nothing is integrated. Joints that are not in `joints`
+    rest in the reference pose of the model.
 
     Args:
         model: compiled mujoco.MjModel.
@@ -44,7 +46,7 @@ def motion_forces(
         activations: (T, na) activations of all actuators; zero if None.
 
     Returns:
-        The required forces and the actuator forces, (T, J) each.
+        The required forces and the actuator forces in N or N m, (T, J) each.
     """
     import mujoco
 

@@ -58,10 +58,11 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
 
     They set the sizes of finite differences and of coefficients. The force is the larger of the
     largest gravity force, and the force for a typical acceleration with the mean inertia. The poses
-    are the same in each call.
+    are the same in each call, by a fixed seed.
 
     Returns:
-        Forces and inertias of the D joints with one coordinate, in the order of the robot's joints.
+        Forces in N or N m, and inertias in kg or kg m^2, of the D joints with one coordinate, in
+        the order of the robot's joints; none is below `MIN_FORCE` or `MIN_INERTIA`.
     """
     import mujoco
 

@@ -127,8 +127,8 @@ class MeasuredLinear(RunLinearisation):
 
         Args:
             simulator: simulator of the robot.
-            theta: (dim,) parameters.
-            scenario: scenario of the run.
+            theta: (P,) parameters of the simulator.
+            scenario: scenario of the run, with its T sample times.
             start: (D,) positions and velocities at which the simulated motion begins.
             trajectory: given motion at all steps.
             measured: alternative to `trajectory`: (T, 3) position, velocity and acceleration at the
@@ -141,12 +141,15 @@ class MeasuredLinear(RunLinearisation):
         self._trajectory, self._measured, self._nearby = trajectory, measured or {}, nearby
         self._reuses_loads = reuses_loads
         if nearby is not None and reuses_jacobians:
+            # The base class takes these Jacobians (difference quotients) instead of computing them.
             self.quotients = nearby._tangent.quotients
+        # Time in seconds for which the base class holds a Jacobian.
         spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
         self.held = float(np.clip(spacing, LINEARISATION_INTERVAL_SECONDS, MAX_JACOBIAN_SECONDS))
         super().__init__(simulator, theta, scenario, *start)
         if self._sensor_channels:
-            # The readings belong to the given motion, not to the simulated one.
+            # The base class has stored the readings of the simulated motion. They are replaced by
+            # those that MuJoCo's sensors would show in the given motion.
             with np.errstate(all="ignore"), capture_mujoco_warnings():
                 readings = self._tangent.motion_readings
             self._readings = dict(zip(self._sensor_channels, readings.T, strict=True))
@@ -180,49 +183,59 @@ class MeasuredLinear(RunLinearisation):
         transmissions are computed for the given motion, unless they are reused and no active effect
         depends on them.
         """
+        # The source of what is not given: the model of a similar motion, or a simulation.
         motion = self._get_nearby_motion() or super()._simulate_nominal_motion()
         trajectory = self._trajectory or self._interpolate_samples(motion)
-        # Joints in series are not measured, so they keep the simulated motion.
-        joints = trajectory.x.shape[1]
+        # The file's joints come first. Joints in series, which are not measured, keep their motion.
+        joint_count = trajectory.x.shape[1]
         x, v = motion.x.copy(), motion.v.copy()
-        x[:, :joints], v[:, :joints] = trajectory.x, trajectory.v
-        moved = replace(motion, x=x, v=v, floating_state=trajectory.floating_state)
+        x[:, :joint_count], v[:, :joint_count] = trajectory.x, trajectory.v
+        given_motion = replace(motion, x=x, v=v, floating_state=trajectory.floating_state)
         simulator, acting = self._simulator, self._work.acting
-        if self._reuses_loads and not any(e.of in LOAD_DEPENDENT_EFFECTS for e, _ in acting):
-            return moved
+        has_load_effect = any(e.of in LOAD_DEPENDENT_EFFECTS for e, _ in acting)
+        if self._reuses_loads and not has_load_effect:
+            return given_motion
+        # The loads are computed on first use, since few effects need them.
         return replace(
-            moved, compute_loads=lambda: compute_transmission_loads(simulator, acting, moved)
+            given_motion,
+            compute_loads=lambda: compute_transmission_loads(simulator, acting, given_motion),
         )
 
     def _get_nearby_motion(self) -> RobotMotion | None:
         """Return the motion of the model `nearby` with the commands of this model.
 
-        It saves a simulation. The result is None if there is no such model, or if the robot has
-        states other than the positions and velocities of the file's joints: only these are given,
-        all others must be simulated.
+        It saves a simulation. The sensor readings of `nearby` are copied, too. The result is None
+        if there is no such model, if no trajectory is given, or if the robot has states other than
+        the positions and velocities of the file's joints: only these are given, all others must be
+        simulated.
         """
         if self._nearby is None or self._trajectory is None:
             return None
+        # A motion has one step more than its run.
         motion, steps = self._nearby._motion, self._steps + 1
-        joints = len(self._simulator.addresses.positions)
-        only_file_joints = (
-            motion.x.shape[1] == joints
-            and not motion.act.size
-            and not motion.floating_state.pose.size
+        joint_count = len(self._simulator.addresses.positions)
+        has_other_states = (
+            motion.x.shape[1] != joint_count  # joints in series
+            or motion.act.size > 0  # activations of filters before actuators
+            or motion.floating_state.pose.size > 0
         )
-        if not only_file_joints or any(is_series_effect(effect) for effect, _ in self._work.acting):
+        # An active effect of this model may add a joint in series that `nearby` does not have.
+        adds_joint = any(is_series_effect(effect) for effect, _ in self._work.acting)
+        if has_other_states or adds_joint:
             return None
         self._readings = dict(self._nearby._readings)
+        inputs = self._simulator.compute_controls(self._work, steps)
         return replace(
             motion,
             compute_loads=lambda: motion.carried,
-            **self._compute_command_fields(self._simulator.compute_controls(self._work, steps)),
+            **self._compute_command_fields(inputs),
         )
 
     def _interpolate_samples(self, motion: RobotMotion) -> Trajectory:
         """Interpolate the measured joints between samples by quintic Hermite polynomials.
 
-        Unmeasured joints of closed loops follow them.
+        They have the measured positions, velocities and accelerations at the samples. Unmeasured
+        joints of closed loops follow them.
 
         Args:
             motion: simulated motion, which all other joints and the floating base keep.
@@ -238,12 +251,16 @@ class MeasuredLinear(RunLinearisation):
         step_times: Array = self._simulator.time_step * np.arange(float(len(x)))
         for joint, samples in self._measured.items():
             x[:, joint], v[:, joint] = interpolate_quintic(self._times, samples, step_times)
-        joints = len(self._simulator.addresses.positions)
-        trajectory = Trajectory(x[:, :joints], v[:, :joints], motion.floating_state)
+        # The file's joints come first; joints in series, which follow, are left out.
+        joint_count = len(self._simulator.addresses.positions)
+        trajectory = Trajectory(x[:, :joint_count], v[:, :joint_count], motion.floating_state)
         return self._close_loops(trajectory) if self._measured else trajectory
 
     def _close_loops(self, trajectory: Trajectory) -> Trajectory:
         """Move unmeasured joints of closed loops as the measured joints make them.
+
+        A closed loop is a chain of links whose ends the model connects, such as a parallelogram.
+        The measured joints of a loop then determine the others, which follow them.
 
         Args:
             trajectory: motion of the measured joints, and simulated motion of the others.
@@ -258,6 +275,7 @@ class MeasuredLinear(RunLinearisation):
             return trajectory
         model, addresses = robot.compiled, self._simulator.addresses
         floating = FloatingJoints.from_robot(robot)
+        # MuJoCo's whole vectors `qpos` and `qvel` at each step.
         positions = np.tile(model.qpos0, (len(trajectory.x), 1))
         velocities = np.zeros((len(trajectory.x), model.nv))
         positions[:, addresses.positions] = trajectory.x
@@ -287,31 +305,39 @@ class MeasuredLinear(RunLinearisation):
         state component is changed at all samples at once.
         """
         tangent, state_size = self._tangent, self._tangent.state_size
+        point_of_step, quotients = tangent.point_of_step, tangent.quotients
+        # d: the defects of all steps, composed to those of the intervals.
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            defects = self._compose(self._tangent.defects)
-        # Responses to the state at the beginning of an interval, without changes in its steps.
-        points, quotients = tangent.point_of_step, tangent.quotients
-        no_changes = np.broadcast_to(0.0, (points.size, state_size, state_size))
-        # Readings at changed states: one motion for each state component, changed in all steps.
-        count = self._motion.x.shape[0]
-        unit_changes = np.broadcast_to(
-            STATE_DIFFERENCE * np.eye(state_size)[:, None, :], (state_size, count, state_size)
+            defects = self._compose(tangent.defects)
+        # A: responses to unit changes of the state at the beginning of an interval. The steps
+        # themselves change nothing.
+        no_changes = np.broadcast_to(0.0, (point_of_step.size, state_size, state_size))
+        state_responses = self._compose(no_changes, np.eye(state_size))
+        # G: the first columns of the responses are those to forces, the others those to controls.
+        force_count = quotients.forces.shape[2]
+        force_responses = self._input_responses[:, :, :force_count]
+        # H: one changed motion for each state component, in which it is larger in all steps.
+        instants = self._motion.x.shape[0]  # beginnings of all steps, and the end
+        state_changes = np.broadcast_to(
+            STATE_DIFFERENCE * np.eye(state_size)[:, None, :], (state_size, instants, state_size)
         )
-        reading_changes = np.zeros((state_size, count, len(self._sensor_channels)))
+        reading_changes = np.zeros((state_size, instants, len(self._sensor_channels)))
         if self._sensor_channels:
-            rows = points[np.minimum(np.arange(count), points.size - 1)]
-            reading_changes = STATE_DIFFERENCE * np.moveaxis(quotients.read_states[rows], 2, 0)
+            # The end has the derivatives of the last step.
+            points = point_of_step[np.minimum(np.arange(instants), point_of_step.size - 1)]
+            reading_changes = STATE_DIFFERENCE * np.moveaxis(quotients.read_states[points], 2, 0)
+        no_sensor_effects: list[ActiveEffects] = [()] * state_size
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             observations = self._compute_observations(
-                unit_changes, reading_changes, [()] * state_size
+                state_changes, reading_changes, no_sensor_effects
             )
-        readings = np.moveaxis((observations - self.observed) / STATE_DIFFERENCE, 0, 2)
+        reading_derivatives = np.moveaxis((observations - self.observed) / STATE_DIFFERENCE, 0, 2)
         return IntervalMaps(
-            states=self._compose(no_changes, np.eye(state_size)),
+            states=state_responses,
             defects=defects,
-            forces=self._input_responses[:, :, : quotients.forces.shape[2]],
+            forces=force_responses,
             inputs=self._input_responses,
-            readings=readings,
+            readings=reading_derivatives,
             predicted=self.observed,
             jumps=self._compute_limit_jumps(),
         )
@@ -337,19 +363,21 @@ class MeasuredLinear(RunLinearisation):
         """Compose state changes in each step to those of each interval between samples.
 
         A change z in an interval becomes A z + (change in this step) in each step, with the
-        derivatives A of the step by the state.
+        derivatives A of the step by the state, a vector of Z components.
 
         Args:
-            values: (S, Z) or (S, Z, m) changes in each step of m kinds, such as unit forces.
+            values: (S, Z) or (S, Z, m) changes in each of S steps of m kinds, such as unit forces.
             initial: (Z, m) changes of the state at the beginnings of the intervals; none by
                 default.
             rows: (S,) row of `values` for each step, if they are not in the order of the steps.
 
         Returns:
-            (T - 1, Z) or (T - 1, Z, m) state changes at the ends of the intervals.
+            (T - 1, Z) or (T - 1, Z, m) state changes at the ends of the intervals between T
+            samples.
         """
         columns = values[:, :, None] if values.ndim == 2 else values
         result = np.full((self.knots.size - 1, *columns.shape[1:]), initial)
+        # Derivatives are computed at some points of the motion; each step has those of its point.
         points, derivatives = self._tangent.point_of_step, self._tangent.quotients.states
         # The first step of all intervals at once, then the second, and so on.
         for steps, intervals in self._list_active_intervals():
@@ -362,18 +390,20 @@ class MeasuredLinear(RunLinearisation):
 
         A servo at its force limit does not follow the linearised model: positions jump by known
         sizes in each step in which the limit is reached. The sum of these jumps in an interval
-        between samples is added to the process noise of a filter.
+        between two of the T samples is added to the process noise of a filter. The Z state
+        components begin with positions, then velocities; the other ones do not jump.
         """
         mujoco_batch = self._simulator.make_linearisation_batch(self._work.acting)
         limits = mujoco_batch.force_limits
         state_changes = np.zeros((self.knots.size - 1, self._tangent.state_size))
-        if not limits.outputs:
+        if not limits.outputs:  # no stiff servo has a limit
             return state_changes
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            reached = np.abs(self._tangent.limited_forces) >= limits.sizes
+            is_limit_reached = np.abs(self._tangent.limited_forces) >= limits.sizes  # (S, servos)
+        # Jumps (servos, D) of the D joints of the file, whose positions come first in a state.
         jumps = limits.jumps[:, mujoco_batch.file_joints.velocities]
         for steps, intervals in self._list_active_intervals():
-            state_changes[intervals, : jumps.shape[1]] += reached[steps] @ jumps
+            state_changes[intervals, : jumps.shape[1]] += is_limit_reached[steps] @ jumps
         # A position servo returns from a jump of position within the interval or later, so the
         # velocity changes by the jump per length of the interval.
         lengths = np.maximum(np.diff(self.knots), 1)[:, None] * self._simulator.time_step
@@ -388,12 +418,17 @@ class MeasuredLinear(RunLinearisation):
         """Discretisation errors (T - 1, Z) of the state, at the end of each sample interval.
 
         They are zero for the Runge-Kutta method, whose order is high. For others they are estimated
-        by steps of half the length, at the linearisation points.
+        by steps of half the length, at the linearisation points. There are T samples and Z state
+        components.
         """
         simulator, tangent = self._simulator, self._tangent
-        if forces_are_at_step_end(simulator.make_linearisation_batch(self._work.acting).model):
+        model = simulator.make_linearisation_batch(self._work.acting).model
+        is_runge_kutta = forces_are_at_step_end(model)  # a property of this integrator only
+        if is_runge_kutta:
             return np.zeros((self.knots.size - 1, tangent.state_size))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
+            # Errors (N, Z) of one step at the N linearisation points; each step has those of its
+            # point.
             errors = tangent.step_errors(simulator.make_half_step_batch(self._work.acting))
             return self._compose(errors, rows=tangent.point_of_step)
 
@@ -407,12 +442,12 @@ class MeasuredLinear(RunLinearisation):
             For the first, second, ... step in an interval: the numbers (k,) of these steps in the
             run, and the numbers (k,) of the intervals that are long enough to have it.
         """
-        lengths = np.diff(self.knots)
+        lengths = np.diff(self.knots)  # numbers of steps
         first_steps = self.knots[:-1]
         result = []
-        for number in range(int(lengths.max(initial=0))):
-            intervals = np.flatnonzero(lengths > number)
-            result.append((first_steps[intervals] + number, intervals))
+        for steps_before in range(int(lengths.max(initial=0))):
+            intervals = np.flatnonzero(lengths > steps_before)
+            result.append((first_steps[intervals] + steps_before, intervals))
         return result
 
     def added(
@@ -435,19 +470,21 @@ class MeasuredLinear(RunLinearisation):
                 if None.
 
         Returns:
-            Mean forces and controls (T - 1, E + nu, K) of each interval, whose product with
-            `IntervalMaps.inputs` is the change b of the state in (3); and direct changes ψ
+            Means (T - 1, E + nu, K) of E forces and nu controls over each interval, whose product
+            with `IntervalMaps.inputs` is the change b of the state in (3); and direct changes ψ
             (T, C, K) of the readings of C channels. Both are in single precision.
         """
         count, samples = len(effects), self.knots.size
         quotients = self._tangent.quotients
-        inputs = quotients.forces.shape[2] + quotients.controls.shape[2]
-        means = np.zeros((samples - 1, inputs, count), dtype=np.float32)
+        input_count = quotients.forces.shape[2] + quotients.controls.shape[2]
+        means = np.zeros((samples - 1, input_count, count), dtype=np.float32)
         readings = np.zeros((samples, self.observed.shape[1], count), dtype=np.float32)
         if driven is None:
             (driven,) = compute_control_changes([self], effects)
+        # The effects are treated in blocks, which limits the memory.
         for begin in range(0, count, CANDIDATES_PER_BLOCK):
             block = range(begin, min(begin + CANDIDATES_PER_BLOCK, count))
+            # Perturbations of the motion, and sensor effects, of each effect of the block.
             changes, sensors = self._list_changes(effects, block, driven)
             columns = slice(begin, block.stop)
             with np.errstate(all="ignore"):
@@ -461,27 +498,29 @@ class MeasuredLinear(RunLinearisation):
         return means, readings
 
     def _compute_interval_means(self, inputs: Array) -> Array:
-        """Return means of forces and controls over the intervals between samples.
+        """Return means of forces and controls over the intervals between T samples.
 
         Args:
-            inputs: (S, E + nu, K) forces and controls in each step.
+            inputs: (S, E + nu, K) forces on E coordinates and nu controls, in each of S steps, by
+                each of K candidate effects.
 
         Returns:
             (T - 1, E + nu, K) means; zero for an interval without a step.
         """
-        lengths = np.diff(self.knots)
+        lengths = np.diff(self.knots)  # number of steps in each interval
         non_empty = np.flatnonzero(lengths)
         means = np.zeros((lengths.size, *inputs.shape[1:]))
-        # Sums from the first step of each interval to that of the next one.
+        # Sums from the first step of each interval to that of the next one. `reduceat` cannot make
+        # an empty sum, so intervals without a step are left out.
         sums = np.add.reduceat(inputs[: self.knots[-1]], self.knots[:-1][non_empty], axis=0)
         means[non_empty] = sums / lengths[non_empty][:, None, None]
         return means
 
     @cached_property
     def _input_responses(self) -> Array:
-        """State changes (T - 1, Z, E + nu) at the end of each interval between samples.
+        """State changes (T - 1, Z, E + nu) at the end of each interval between T samples.
 
-        They are per unit of a generalised force or a control that is constant over the
+        They are per unit of one of E generalised forces or nu controls that is constant over the
         interval.
         """
         quotients = self._tangent.quotients
@@ -512,15 +551,17 @@ class MeasuredLinear(RunLinearisation):
         if not changing:
             return direct_changes
         has_sensor_effect = np.array([bool(sensors[k]) for k in changing])
-        # Deviations of one motion for each of these candidates: the predicted motion if it has
-        # sensor effects. The last row has no sensor effects; it is the reference for the others.
+        # One motion for each of these candidates, and a last one as the reference for candidates
+        # with sensor effects: the predicted motion without them. A motion is given by the
+        # deviations of its states from the given motion; those of candidates without sensor effects
+        # are zero.
         states = np.zeros((len(changing) + 1, self._motion.x.shape[0], self._tangent.state_size))
         if has_sensor_effect.any():
-            forces = self._tangent.quotients.forces.shape[2]
-            unforced = np.zeros((self.knots.size - 1, forces))
-            states[np.append(has_sensor_effect, True)] = self.propagate_deviations(
-                predicted, unforced
-            )
+            force_count = self._tangent.quotients.forces.shape[2]
+            no_forces = np.zeros((self.knots.size - 1, force_count))
+            is_predicted = np.append(has_sensor_effect, True)
+            states[is_predicted] = self.propagate_deviations(predicted, no_forces)
+        # Direct changes of readings by effects in the model, none in the reference.
         changes = np.concatenate(
             [np.moveaxis(readings[:, :, changing], 2, 0), np.zeros((1, *readings.shape[:2]))]
         )
@@ -541,8 +582,8 @@ class MeasuredLinear(RunLinearisation):
         the given one again.
 
         Args:
-            deviations: (T, Z) deviations δ at the T samples.
-            forces: (T - 1, E) forces f, constant between samples.
+            deviations: (T, Z) deviations δ of Z state components at the T samples.
+            forces: (T - 1, E) forces f on E coordinates, constant between samples.
 
         Returns:
             (S + 1, Z) deviations at the beginnings of the S steps and at the end; after the last
@@ -553,14 +594,16 @@ class MeasuredLinear(RunLinearisation):
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             defects = tangent.defects
         deviations_at_steps = np.zeros((self._motion.x.shape[0], tangent.state_size))
-        state = deviations[:-1].copy()
+        # Deviations at the present step of each interval: the first step of all intervals at once,
+        # then the second, and so on.
+        present = deviations[:-1].copy()
         with np.errstate(all="ignore"):
             for steps, intervals in self._list_active_intervals():
-                deviations_at_steps[steps] = delta = state[intervals]
+                deviations_at_steps[steps] = delta = present[intervals]
                 a, b = quotients.states[points[steps]], quotients.forces[points[steps]]
                 propagated = np.einsum("izy,iy->iz", a, delta)
                 forced = np.einsum("ize,ie->iz", b, forces[intervals])
-                state[intervals] = propagated - defects[steps] + forced
+                present[intervals] = propagated - defects[steps] + forced
         deviations_at_steps[self.knots[-1] :] = deviations[-1]
         return deviations_at_steps
 
@@ -577,17 +620,20 @@ class MeasuredLinear(RunLinearisation):
         """
         # The motion is not changed where the linear model diverges.
         deviations = np.where(np.abs(deviations) < MAX_DEVIATION, deviations, 0.0)
-        joints, motion = len(self._simulator.addresses.positions), self._motion
-        size, na = motion.x.shape[1], motion.act.shape[1]
-        first_floating = 2 * size + na + len(self._tangent.hidden_state_effects)
+        motion = self._motion
+        # Joints of the file come first, then those that effects have added in series with them.
+        file_joints, all_joints = len(self._simulator.addresses.positions), motion.x.shape[1]
+        activations = motion.act.shape[1]
+        first_floating = 2 * all_joints + activations + len(self._tangent.hidden_state_effects)
         displacements, rates = np.split(deviations[:, first_floating:], 2, axis=1)
         pose = motion.floating_state.pose
         if displacements.size:
+            # Displacements include rotations, which cannot be added to a pose with quaternions.
             floating = self._simulator.make_linearisation_batch(self._work.acting).floating
             pose = floating.displace(pose, displacements)
         return Trajectory(
-            motion.x[:, :joints] + deviations[:, :joints],
-            motion.v[:, :joints] + deviations[:, size : size + joints],
+            motion.x[:, :file_joints] + deviations[:, :file_joints],
+            motion.v[:, :file_joints] + deviations[:, all_joints : all_joints + file_joints],
             FloatingState(pose, motion.floating_state.rate + rates),
         )
 
@@ -640,6 +686,7 @@ def interpolate_quintic(times: Array, samples: Array, instants: Array) -> tuple[
         Values and first derivatives (n,).
     """
     within = np.clip(instants, times[0], times[-1])
+    # Index of the last sample before each instant; the last sample belongs to the last interval.
     below = np.clip(np.searchsorted(times, within, side="right") - 1, 0, times.size - 2)
     h = times[below + 1] - times[below]
     s = (within - times[below]) / h  # from 0 to 1 between two samples

@@ -79,11 +79,12 @@ class RunLinearisation:
         """
         assert isinstance(simulator, RobotSimulator), "a robot"
         self._simulator = simulator
-        self._clock = float(scenario.times[0])
+        self._clock = float(scenario.times[0])  # time stamp of the first sample
         self._times = scenario.times - self._clock
         self._steps = simulator.count_steps(self._times)
         acting = simulator.get_active_effects(theta[None])
         commands = simulator.run_inputs(scenario)
+        # The run as a batch of one element, with its active effects.
         self._work = RobotRunBatch(scenario, commands, acting, x[None], v[None])
         # Channels that observe MuJoCo's sensors: drive forces (tau.) and sensors (s.).
         self._sensor_channels = [
@@ -94,9 +95,10 @@ class RunLinearisation:
             self._tangent = self._make_tangent_model()
             # Batch elements that the preparation took, which are part of the cost.
             self._preparation_count = self._tangent.placed_element_count
+        # Forces and readings of `_list_perturbations`, by name and coefficients of the effect.
         self._perturbation_cache: dict[tuple[str, bytes], tuple[Array, Array]] = {}
         self.observed = self._observe_nominal_motion()
-        # The joints of the file come first; joints in series follow them.
+        # Number of the joints of the file, which come first; joints in series follow them.
         self._joints = len(simulator.addresses.positions)
 
     def _observe_nominal_motion(self) -> Array:
@@ -123,6 +125,8 @@ class RunLinearisation:
         # The batch has one element.
         fields = {name: values[0] for name, values in simulated.fields.items()}
         dofs = mujoco_batch.all_joints.velocities
+        # Forces (2, S, D) on both sides of the transmissions: those of the actuators, and those of
+        # gravity and motion. Other integrators than Runge-Kutta leave those of a step's beginning.
         carried = np.stack([fields[name][:, dofs] for name in TRANSMISSION_FORCE_FIELDS])
         if forces_are_at_step_end(mujoco_batch.model):
             carried = compute_midpoint_loads(carried, inputs.controls[0])
@@ -134,6 +138,7 @@ class RunLinearisation:
         return RobotMotion(
             x=np.concatenate([simulated.x[0], series_x[0]], axis=1),
             v=np.concatenate([simulated.v[0], series_v[0]], axis=1),
+            # Recorded fields begin after the first step, so the initial value is prepended.
             act=np.concatenate([simulated.initial_activations[:1], fields["act"][:-1]]),
             compute_loads=lambda: carried,
             floating_state=self._get_floating_states(simulated.fields),
@@ -166,6 +171,9 @@ class RunLinearisation:
 
         Args:
             fields: recorded `qpos` and `qvel` after each step, (1, S, ...).
+
+        Returns:
+            Poses (S + 1, P) and velocities (S + 1, F).
         """
         start = self._simulator.get_floating_start(self._work)
         floating = self._simulator.make_linearisation_batch(self._work.acting).floating
@@ -230,8 +238,10 @@ class RunLinearisation:
             (K, T, C) changes of the observations at T samples of C channels; and the approximate
             cost as a number of simulations of the run, including the linearisation itself.
         """
-        before = self._tangent.placed_element_count - self._preparation_count
-        # The cost must not depend on earlier calls.
+        # Cost of earlier calls, as a number of batch elements. The cost of the preparation counts
+        # in each call.
+        earlier_count = self._tangent.placed_element_count - self._preparation_count
+        # Without cached results of earlier calls, the cost does not depend on them.
         self._perturbation_cache.clear()
         responses = np.zeros((len(added), *self.observed.shape))
         (control_changes,) = compute_control_changes([self], added)
@@ -250,9 +260,12 @@ class RunLinearisation:
                 states, readings = self._tangent.propagate(changes, len(block))
                 observations = self._compute_observations(states, readings, sensors)
             not_in_series = np.setdiff1d(block, in_series).astype(np.intp)
-            responses[not_in_series] = (observations - self.observed)[not_in_series - block.start]
-        placed_count = self._tangent.placed_element_count - before
-        return responses, 1 + len(in_series) + placed_count // len(self._motion.controls)
+            rows_of_block = not_in_series - block.start
+            responses[not_in_series] = (observations - self.observed)[rows_of_block]
+        # One simulation of S steps costs as much as S batch elements that make one step.
+        placed_count = self._tangent.placed_element_count - earlier_count
+        simulations = placed_count // len(self._motion.controls)
+        return responses, 1 + len(in_series) + simulations
 
     def _list_changes(
         self,
@@ -267,9 +280,9 @@ class RunLinearisation:
 
         Args:
             added: effects with their coefficients.
-            effect_indices: indices of the effects; the first owns the perturbations with owner 0,
-                the second those with owner 1, and so on.
-            control_changes: changes of the controls by effects on inputs, by index of the effect.
+            effect_indices: indices in `added` of the effects to divide; the first owns the
+                perturbations with owner 0, the second those with owner 1, and so on.
+            control_changes: changes of the controls by effects on inputs, by index in `added`.
 
         Returns:
             Perturbations of the motion by all these effects, and the sensor effects of each one.
@@ -278,12 +291,15 @@ class RunLinearisation:
         sensors: list[ActiveEffects] = []
         for owner, effect_index in enumerate(effect_indices):
             effect, c = added[effect_index]
+            # The effect at each of its places, with coefficients (k, 1, 1).
             parts = effect.parts(c[:, None, None])
-            sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
-            for part, k in parts:
+            sensors.append(
+                tuple((part, part_c) for part, part_c in parts if isinstance(part, Sensor))
+            )
+            for part, part_c in parts:
                 is_handled_otherwise = isinstance(part, (Sensor, Input)) or is_series_effect(part)
-                if not is_handled_otherwise and k.any():
-                    changes += self._list_perturbations(owner, part, k)
+                if not is_handled_otherwise and part_c.any():
+                    changes += self._list_perturbations(owner, part, part_c)
             input_changes = control_changes.get(effect_index, ())
             changes += [change._replace(owner=owner) for change in input_changes]
         return changes, sensors
@@ -296,18 +312,21 @@ class RunLinearisation:
         Coulomb friction, takes its coefficient over and replaces it.
         """
         count, work = len(added), self._work
-        # Coefficients (k, K, 1): those of the run in all elements, then one added effect in each.
-        acting = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
+        # Coefficients (k, K, 1) of the effects of the run, in all elements.
+        run_effects = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
+        # Each added effect has coefficients in its own element, and zeros in all others.
+        added_effects = []
         for element, (effect, c) in enumerate(added):
-            for simpler, k in acting[: len(work.acting)]:
-                if simpler.name in effect.contains and k[:, element].any():
-                    c = effect.taking(c, simpler.name, k[:, element, 0].copy())
-                    k[:, element] = 0.0
+            for simpler, run_c in run_effects:
+                if simpler.name in effect.contains and run_c[:, element].any():
+                    c = effect.taking(c, simpler.name, run_c[:, element, 0].copy())
+                    run_c[:, element] = 0.0
             coefficients = np.zeros((len(c), count, 1))
             coefficients[:, element, 0] = c
-            acting.append((effect, coefficients))
+            added_effects.append((effect, coefficients))
+        acting = (*run_effects, *added_effects)
         x, v = np.repeat(work.x, count, axis=0), np.repeat(work.v, count, axis=0)
-        return self._simulator.simulate_observations(work._replace(acting=tuple(acting), x=x, v=v))
+        return self._simulator.simulate_observations(work._replace(acting=acting, x=x, v=v))
 
     def compute_initial_state_responses(self) -> Array:
         """Compute the derivatives of observations by initial positions and velocities.
@@ -343,6 +362,7 @@ class RunLinearisation:
             effect: effect at one place.
             c: (K, 1, 1) its coefficients.
         """
+        # Name of the registered effect, without a place; index of its joint, or None.
         name = effect.of or effect.name
         joint = effect.coordinate
         if name == "inertia.armature" and joint is not None:
@@ -397,13 +417,15 @@ class RunLinearisation:
                 (K, 1, 1).
         """
         count = len(input_effects)
+        # Effects by name, with coefficients (K, n, 1): those of the run in all elements, then one
+        # further effect in each element.
         acting: dict[str, tuple[Effect, Array]] = {}
-        for e, c in self._work.acting:
-            if isinstance(e, Input):
-                acting[e.name] = e, np.repeat(c, count, axis=1)
-        for element, (effect, k) in enumerate(input_effects):
-            _, coefficients = acting.setdefault(effect.name, (effect, np.zeros((len(k), count, 1))))
-            coefficients[:, element] = k[:, 0]
+        for run_effect, run_c in self._work.acting:
+            if isinstance(run_effect, Input):
+                acting[run_effect.name] = run_effect, np.repeat(run_c, count, axis=1)
+        for element, (effect, c) in enumerate(input_effects):
+            _, coefficients = acting.setdefault(effect.name, (effect, np.zeros((len(c), count, 1))))
+            coefficients[:, element] = c[:, 0]
         steps = len(self._motion.controls)
         scenario, commands = self._work.scenario, self._work.commands
         return RunInputs(scenario, commands, tuple(acting.values()), count, steps)
@@ -414,38 +436,40 @@ class RunLinearisation:
         """Compute observations (n, T, C) of n perturbed motions, with further sensor effects.
 
         Positions and velocities are those of the motion plus their changes; other channels are
-        sensor readings plus their changes. Then the sensor effects act on them. The channels are
+        sensor readings plus their changes. Then the sensor effects act on them. The C channels are
         sampled at the T times of the run.
 
         Args:
-            states: (n, S, Z) changes of the states at the beginnings of S steps.
+            states: (n, S, Z) changes of the Z state components at the beginnings of S steps.
             readings: (n, S, M) changes of the readings of M sensor channels.
             sensors: further sensor effects of each of the n motions.
         """
         simulator, count = self._simulator, len(states)
-        step_count = self._steps + 1
-        size = self._motion.x.shape[1]
+        instants = self._steps + 1  # beginnings of the steps of the run, and its end
+        position_count = self._motion.x.shape[1]
         run_effects = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._work.acting)
         columns = []
-        sample_steps = find_sample_steps(simulator.time_step, self._times, step_count)
+        sample_steps = find_sample_steps(simulator.time_step, self._times, instants)
         for channel in simulator.channels:
             acting = _select_sensor_effects(channel.name, run_effects, sensors)
             # If all samples are at beginnings of steps, only these steps are needed. A sensor
             # effect that shifts time or filters needs all steps.
             needed_steps = sample_steps if preserves_time(acting) else None
             rows: slice | NDArray[np.intp] = (
-                slice(step_count) if needed_steps is None else needed_steps
+                slice(instants) if needed_steps is None else needed_steps
             )
             kind, _, joint_name = channel.name.partition(".")
             slopes = None
-            # Velocities follow the `size` positions in a state.
             if kind in ("q", "qd"):
+                # Velocities follow the positions in a state.
                 j = simulator.system.coordinates.index(f"q.{joint_name}")
-                column = j if kind == "q" else size + j
+                velocity_column = position_count + j
+                column = j if kind == "q" else velocity_column
                 motion = self._motion.x if kind == "q" else self._motion.v
                 values = motion[rows, j] + states[:, rows, column]
+                # Positions are interpolated between steps with their velocities.
                 if kind == "q" and needed_steps is None:
-                    slopes = self._motion.v[rows, j] + states[:, rows, size + j]
+                    slopes = self._motion.v[rows, j] + states[:, rows, velocity_column]
             else:
                 column = self._sensor_channels.index(channel.name)
                 values = self._readings[channel.name][rows] + readings[:, rows, column]
@@ -462,8 +486,8 @@ def compute_control_changes(
 ) -> list[dict[int, list[Perturbation]]]:
     """Compute the changes of controls by added input effects, such as a gain or a delay.
 
-    Input effects act before the robot, so their changes are computed exactly and only propagated
-    to first order. The steps are:
+    Input effects act before the robot, so their changes of the controls are exact; only the
+    response of the motion to them is linearised, later. The steps are:
 
     1. List the input effects at one place each. Each is an element of a batch.
     2. Compute the changed inputs of all runs together: their means over the steps, which move the
@@ -480,20 +504,21 @@ def compute_control_changes(
     """
     # 1. Input effects.
     changes_by_run: list[dict[int, list[Perturbation]]] = [{} for _ in runs]
-    effect_indices: list[int] = []
+    effect_indices: list[int] = []  # index in `added` of each of the input effects
     input_effects: list[tuple[Effect, Array]] = []
     for effect_index, (effect, c) in enumerate(added):
-        for part, k in effect.parts(c[:, None, None]):
-            if isinstance(part, Input) and k.any():
+        for part, part_c in effect.parts(c[:, None, None]):
+            if isinstance(part, Input) and part_c.any():
                 effect_indices.append(effect_index)
-                input_effects.append((part, k))
+                input_effects.append((part, part_c))
     if not input_effects:
         return changes_by_run
-    # 2. Changed inputs, by run and batch element: for each share of a step, values (S,).
+    # 2. Changed inputs, by run and batch element: for each share of a step, values (S,). The whole
+    # step gives the mean; a tiny share at its beginning gives the value there.
     simulator, names = runs[0]._simulator, runs[0]._sensor_channels
     inputs = [run._get_inputs_with_effects(tuple(input_effects)) for run in runs]
     shares = [1.0]
-    if any(name.startswith("tau.") for name in names):
+    if any(name.startswith("tau.") for name in names):  # drive forces
         shares.append(SAME_INSTANT_SHARE)
     control_indices = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
     series: dict[tuple[int, int], list[Array]] = {}
@@ -502,10 +527,11 @@ def compute_control_changes(
             simulator.time_step, inputs, share
         ):
             for element, series_row in zip(elements.tolist(), values, strict=True):
+                # An element may also have an effect of the run, on another input.
                 effect, _ = input_effects[element]
                 if effect.signal == name:
                     series.setdefault((run, element), []).append(series_row)
-    # 3. Changes of controls.
+    # 3. Changes of controls. `instants` is empty if drive forces are not observed.
     for (run, element), (means, *instants) in sorted(series.items()):
         effect_index, (effect, _) = effect_indices[element], input_effects[element]
         if effect.signal not in control_indices:  # a force, which is not an actuator's control
@@ -540,6 +566,7 @@ def _select_sensor_effects(
         Effects with coefficients (K, L, 1). Those of an additional effect are zero in all elements
         that do not have it.
     """
+    # An effect without a signal acts on all channels.
     acting = [(e, c) for e, c in run_effects if isinstance(e, Sensor) and e.signal in ("", channel)]
     added: dict[str, tuple[Effect, Array]] = {}
     for element, parts in enumerate(extra_effects):

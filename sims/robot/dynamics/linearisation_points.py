@@ -116,8 +116,8 @@ class LinearisationPoints:
     ) -> None:
         """Choose the points of the motion, and prepare the batch (fields, effects, state).
 
-        Also integrate the hidden states of the effects along the motion, since each point
-        needs them.
+        A linearisation point is a step of the motion at which derivatives are computed. Also
+        integrate the hidden states of the effects along the motion, since each point needs them.
 
         Args:
             mujoco_batch: batch of the robot; its size is the number of points evaluated together.
@@ -139,6 +139,7 @@ class LinearisationPoints:
         # Forces (n, D) of effects in drives, which a sensor of drive forces shows.
         self._drive_effect_forces = np.zeros((0, 0))
         self._floating = mujoco_batch.floating
+        # Addresses of the velocities of all joints and floating bodies.
         self._dofs = np.append(joints.velocities, self._floating.velocities)
         self.point_spacing = max(round(held / motion.step), 1)
         # Fields must be bound before MuJoCo's first call, since later ones are not updated before
@@ -148,9 +149,11 @@ class LinearisationPoints:
         # Effects whose forces are evaluated here, because no model field represents them.
         self._step_effects = StepEffects.from_active(acting)
         if any(self._step_effects):
-            # The loads are computed with the same batch, so they must be known before it is used.
+            # Reading this property computes the loads of the transmissions with the same batch, so
+            # it comes before the batch is prepared.
             _ = motion.carried
         mujoco_batch.write_effects(_repeat_coefficients(acting, mujoco_batch.count))
+        # All elements have the same effects, so the stiffness of the first one is that of all.
         self._stiffness = mujoco_batch.get_servo_stiffness(joints)[:1]
         self._is_servo_on = find_working_servos(mujoco_batch.robot, joints.velocities, motion.off)
         self._hidden_states = [
@@ -158,6 +161,7 @@ class LinearisationPoints:
         ]
         self.hidden_state_effects = range(len(self._hidden_states))
         self._next_hidden_states: list[HiddenState] = []
+        # The state to which a batch is set before points are placed in it.
         mujoco_batch.batch.reset(stage=0)
         self._reset_state = mujoco_batch.batch.state.copy()
         # At first, all steps are points, since contacts may change at any of them.
@@ -172,6 +176,8 @@ class LinearisationPoints:
         count as changed if any derivative differs from that at the last change by more than
         `MAX_RELATIVE_CHANGE` times the typical largest derivative of a step.
         """
+        # States (S, Z) after a step from each of the S steps, and their derivatives by x, y and z
+        # of each floating body, which slide joints represent.
         unmoved, _ = self.step_displaced({}, self.acting)
         columns = []
         for body in self._mujoco_batch.robot.recorded_bases:
@@ -181,10 +187,10 @@ class LinearisationPoints:
                 columns.append((moved - unmoved) / CONTACT_DIFFERENCE)
         derivatives = np.concatenate(columns, axis=1)
         limit = MAX_RELATIVE_CHANGE * np.median(np.abs(derivatives).max(axis=1))
-        has_changed, reference = np.zeros(len(derivatives), dtype=bool), derivatives[0]
+        has_changed, at_last_change = np.zeros(len(derivatives), dtype=bool), derivatives[0]
         for step, derivative in enumerate(derivatives):
-            if not np.abs(derivative - reference).max() <= limit:  # also for NaN
-                has_changed[step], reference = True, derivative
+            if not np.abs(derivative - at_last_change).max() <= limit:  # also for NaN
+                has_changed[step], at_last_change = True, derivative
         return has_changed
 
     def _bind_fields(self, mujoco_batch: MujocoBatch) -> None:
@@ -236,8 +242,8 @@ class LinearisationPoints:
         derivative of a step.
 
         Args:
-            moved: index and size of the displacement by its quantity, as in `_place_points`; none
-                if empty.
+            moved: index and size of the displacement by its quantity: ``{"q": (2, 1e-6)}`` moves
+                joint 2. The quantities are those of `_place_points`. Nothing moves if empty.
             acting: effects whose elements are in the model.
             steps: number of steps, for a batch with shorter ones.
 
@@ -248,6 +254,7 @@ class LinearisationPoints:
             motion after the step.
         """
         states, readings = [], []
+        # `bind` returns a field of MuJoCo's data, with one row for each batch element.
         bind, joints, floating = self._mujoco_batch.batch.bind, self._joints, self._floating
         begin = 0  # number of points in earlier batches
         for point_count, ids in self._place_points(moved, acting):
@@ -259,8 +266,10 @@ class LinearisationPoints:
             ]
             if self.motion.act.shape[1]:
                 state_columns.append(bind("act")[:point_count])
+            # `_place_points` has advanced the hidden states of effects by one step.
             state_columns += [state.v for state in self._next_hidden_states]
             if floating:
+                # Poses of the motion at the ends of the steps.
                 unperturbed = self.motion.floating_state.pose[
                     self.point_steps[begin : begin + point_count] + 1
                 ]
@@ -286,9 +295,10 @@ class LinearisationPoints:
 
         Args:
             acting: effects whose elements are in the model.
-            extra_forces: (N, E) additional forces; none by default.
-            moved: index and size of a displacement by its quantity, as in `_place_points`; none by
+            extra_forces: (N, E) additional forces on all joints and floating bodies; none by
                 default.
+            moved: index and size of a displacement by its quantity: ``{"q": (2, 1e-6)}`` moves
+                joint 2. The quantities are those of `_place_points`. None by default.
             at_centres: whether joints have the state in the middle of the steps that a point stands
                 for, instead of that at the point.
 
@@ -297,22 +307,24 @@ class LinearisationPoints:
             outputs.
         """
         accelerations, readings = [], []
-        applied = self._mujoco_batch.batch.bind("qfrc_applied")
-        dofs, begin = self._dofs, 0  # begin: number of points in earlier batches
+        batch, dofs = self._mujoco_batch.batch, self._dofs
+        # Fields of MuJoCo's data, with one row for each batch element.
+        applied_forces, qacc = batch.bind("qfrc_applied"), batch.bind("qacc")
+        begin = 0  # number of points in earlier batches
         for n, ids in self._place_points(moved or {}, acting, at_centres):
             if extra_forces is not None:
-                applied[:n, dofs] += extra_forces[begin : begin + n]
+                applied_forces[:n, dofs] += extra_forces[begin : begin + n]
             begin += n
-            self._mujoco_batch.batch.forward(ids)
-            accelerations.append(self._mujoco_batch.batch.bind("qacc")[:n, dofs].copy())
+            batch.forward(ids)
+            accelerations.append(qacc[:n, dofs].copy())
             readings.append(self._read_outputs(n))
         return np.concatenate(accelerations), np.concatenate(readings)
 
     def _read_outputs(self, n: int) -> Array:
         """Read the O outputs from the first n elements of the batch, (n, O).
 
-        Readings of drive forces include the forces that effects exert in the drive, which MuJoCo
-        does not know.
+        An output is one column of a field of MuJoCo's data. Readings of drive forces include the
+        forces that effects exert in the drive, which MuJoCo does not know.
         """
         bind = self._mujoco_batch.batch.bind
         columns = [bind(name)[:n, column, None] for name, column in self._outputs]
@@ -320,6 +332,7 @@ class LinearisationPoints:
             return np.zeros((n, 0))
         readings = np.concatenate(columns, axis=1)
         if self._drive_effect_forces.size:
+            # `_drives` has the joint of each output that is a drive force, and -1 for others.
             is_drive = self._drives >= 0
             readings[:, is_drive] += self._drive_effect_forces[:, self._drives[is_drive]]
         return readings
@@ -357,13 +370,14 @@ class LinearisationPoints:
         """
         motion, joints, floating = self.motion, self._joints, self._floating
         count = self._mujoco_batch.count
-        self.placed_count += self.point_steps.size
+        self.placed_count += self.point_steps.size  # a measure of the cost
         self._mujoco_batch.write_effects(_repeat_coefficients(acting, count))
         batch = self._mujoco_batch.batch
+        # `bind` returns a field of MuJoCo's data, with one row for each batch element.
         bind = batch.bind
         qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         applied = bind("qfrc_applied")
-        na = motion.act.shape[1]
+        has_activations = bool(motion.act.shape[1])
         # Columns of MuJoCo's data of the quantities to which a displacement is simply added.
         columns = {
             "q": lambda k: qpos[:, joints.positions[k]],
@@ -373,6 +387,7 @@ class LinearisationPoints:
             "a": lambda k: bind("act")[:, k],
             "r": lambda k: qvel[:, floating.velocities[k]],
         }
+        # An actuator is switched off by a force range of zero.
         ranges: ForceRanges | None = None
         if motion.off[self.point_steps].any():
             ranges = self._mujoco_batch.force_ranges()
@@ -392,16 +407,20 @@ class LinearisationPoints:
             qvel[:point_count, floating.velocities] = motion.floating_state.rate[steps]
             ctrl[:point_count] = motion.controls[steps]
             applied[:point_count] = motion.forces[steps]
-            if na:
+            if has_activations:
                 bind("act")[:point_count] = motion.act[steps]
-            # Poses are quaternions, which are rotated; hidden states are not in MuJoCo's data.
+            # Poses have quaternions, which are rotated. Hidden states are not in MuJoCo's data, so
+            # their displacement is passed to the effects.
+            hidden_state_changes: dict[int, float] = {}
             for name, (k, size) in moved.items():
                 if name == "p":
                     poses = floating.displace_coordinate(motion.floating_state.pose[steps], k, size)
                     qpos[:point_count, floating.positions] = poses
-                elif name != "w":
+                elif name == "w":
+                    hidden_state_changes[k] = size
+                else:
                     columns[name](k)[:point_count] += size
-            self._add_effect_forces(steps, point_count, dict([moved["w"]]) if "w" in moved else {})
+            self._add_effect_forces(steps, point_count, hidden_state_changes)
             yield point_count, self._mujoco_batch.get_element_ids(point_count)
 
     def _add_effect_forces(
@@ -411,19 +430,20 @@ class LinearisationPoints:
 
         Forces are added to the applied forces of the batch, and dry friction is written into the
         friction limits of its model. Also advance the hidden states of the effects by one step, for
-        `step_displaced`.
+        `step_displaced`; a hidden state is a variable that an effect has in addition to the state
+        of the robot.
 
         Args:
             steps: (n,) steps of the points.
             n: number of batch elements in use.
             state_changes: displacements of hidden states, by their numbers.
         """
-        effects = self._step_effects
+        effects = self._step_effects  # three groups: forces, dry friction and hidden states
         if not any(effects):
             return
         bind, joints = self._mujoco_batch.batch.bind, self._joints
         motion = self.motion
-        # Snapshot of the displaced states.
+        # Snapshot of the displaced states, with the loads of the transmissions (2, n, D).
         x = bind("qpos")[:n, joints.positions]
         v = bind("qvel")[:n, joints.velocities]
         if any(e.of in LOAD_DEPENDENT_EFFECTS for group in effects for e, _ in group):
@@ -435,8 +455,9 @@ class LinearisationPoints:
         else:
             carried = motion.carried[:, steps]
         snapshot = self._make_snapshot(steps, x, v, carried)
-        # Forces, hidden states and dry friction.
+        # Forces, hidden states and dry friction. All n elements have the same coefficients.
         acting = effects.with_coefficients(np.repeat(effects.coefficients.T, n, axis=0))
+        # Forces in drives are stored, since sensors of drive forces show them.
         self._drive_effect_forces = compute_drive_effect_forces(acting.forces, snapshot)
         other_forces = [(effect, c) for effect, c in acting.forces if not is_in_drive(effect)]
         force = self._drive_effect_forces + compute_effect_forces(other_forces, snapshot)
@@ -461,7 +482,7 @@ class LinearisationPoints:
     def _make_snapshot(
         self, steps: IndexArray, x: Array, v: Array, carried: Array
     ) -> RobotSnapshot:
-        """Return the snapshot at the beginning of each of n steps.
+        """Return the snapshot (the state that effects receive) at the beginning of each of n steps.
 
         Args:
             steps: (n,) the steps.
@@ -469,7 +490,7 @@ class LinearisationPoints:
             v: (n, D) velocities.
             carried: (2, n, D) forces on both sides of the transmissions.
         """
-        t: Array = self.motion.step * steps[:, None].astype(np.float64)
+        t: Array = self.motion.step * steps[:, None].astype(np.float64)  # s
         inputs = {name: u[steps, None] for name, u in self.motion.inputs.items()}
         stiffness = self.get_servo_stiffness(steps)
         return make_snapshot(self._system, t, x, v, inputs, carried, stiffness)
@@ -488,6 +509,7 @@ class LinearisationPoints:
         """
         previous = self._mujoco_batch, self._reset_state
         if mujoco_batch is not self._mujoco_batch:
+            # Fields that are bound after MuJoCo's first call would not be updated by it.
             self._bind_fields(mujoco_batch)
             mujoco_batch.batch.reset(stage=0)
             self._mujoco_batch, self._reset_state = mujoco_batch, mujoco_batch.batch.state.copy()
@@ -498,7 +520,7 @@ class LinearisationPoints:
 
     @contextmanager
     def at_steps(self, steps: IndexArray) -> Iterator[None]:
-        """Evaluate other steps, instead of the linearisation points."""
+        """Evaluate other steps of the motion (n,) within a `with` block, instead of the points."""
         previous = self.point_steps
         self.point_steps = steps
         try:
@@ -515,6 +537,7 @@ class LinearisationPoints:
         """
         previous = self._outputs, self._drives
         self._outputs = self._mujoco_batch.force_limits.outputs
+        # No output counts as the reading of a drive-force sensor, to which effects would be added.
         self._drives = np.full(len(self._outputs), -1)
         self._bind_fields(self._mujoco_batch)
         try:
@@ -533,6 +556,7 @@ class LinearisationPoints:
         self._mujoco_batch.write_effects(
             _repeat_coefficients(self.acting, self._mujoco_batch.count)
         )
+        # All batch elements have the same effects, so the model of the first one is that of all.
         model = self._mujoco_batch.batch.get_model(0)
         data = mujoco.MjData(model)
         joints = self._joints
@@ -559,8 +583,9 @@ class LinearisationPoints:
         Args:
             effect: effect in a drive.
             c: coefficients (K, 1, 1).
-            readings: (N, O) readings without the effect.
+            readings: (N, O) readings of the O outputs without the effect.
         """
+        # Outputs that are no drive forces have the joint -1.
         motion, steps, joint_of_output = self.motion, self.point_steps, self._drives
         is_drive = joint_of_output >= 0
         # The effect depends on the drive forces, the first of both loads of a transmission. The
@@ -586,10 +611,13 @@ class LinearisationPoints:
             effect: effect with a force, a friction or a hidden state.
             c: coefficients (K, 1, 1).
         """
+        # Each step is one batch element of the snapshot, all with the same coefficients.
         coefficients = np.repeat(c, len(self.motion.controls), axis=1)
         if isinstance(effect, HiddenStateEffect):
             state = self.integrate_hidden_state(effect, c)
-            midpoint_state = HiddenState(*(0.5 * (u[1:] + u[:-1]) for u in (state.x, state.v)))
+            midpoint_state = HiddenState(
+                0.5 * (state.x[1:] + state.x[:-1]), 0.5 * (state.v[1:] + state.v[:-1])
+            )
             force, _ = effect.act(coefficients, self.snapshot, midpoint_state)
             return force
         if isinstance(effect, Force):
@@ -607,10 +635,11 @@ class LinearisationPoints:
         MuJoCo's dry friction is not a jump of the force with the sign of the velocity. It is a
         constraint that pulls the velocity to zero with a force of at most the limit
         (https://mujoco.readthedocs.io/en/stable/computation/index.html, "Friction loss"). The
-        constraint has the reference acceleration -b v with b = 2 / (d_max timeconst), and the
-        regularisation R = A (1 - d) / d, with its impedance d and the inverse inertia A of the
-        joint. With the velocity v at the beginning of a step, the acceleration a over it, and the
-        acceleration A f by f itself, the force is
+        constraint has the reference acceleration -b v with b = 2 / (d_max timeconst), where d_max
+        and timeconst are parameters of MuJoCo's solver. It has the regularisation
+        R = A (1 - d) / d, with its impedance d and the inverse inertia A of the joint. With the
+        velocity v at the beginning of a step, the acceleration a over it, and the acceleration A f
+        by the friction force f itself, this force is
 
             f = -clip((a + b v + A f) / R, -limit, limit) = -clip(d (a + b v) / A, -limit, limit)
 
@@ -646,9 +675,10 @@ class LinearisationPoints:
 
     @cached_property
     def snapshot(self) -> RobotSnapshot:
-        """The whole motion as a snapshot of S batch elements, at the middle of each step.
+        """The whole motion as a snapshot (the state that effects receive) of S batch elements.
 
-        Positions and velocities are the means of both ends of a step.
+        Each of the S steps is one batch element, at the middle of the step. Positions and
+        velocities are the means of both ends of a step.
         """
         motion = self.motion
         steps = len(motion.controls)
@@ -689,14 +719,16 @@ def _choose_points(
     changes[1:] |= (motion.off[1:] != motion.off[:-1]).any(axis=1)
     if contact_changes is not None:
         changes |= contact_changes
-    numbers = np.arange(steps)
-    last_change = np.maximum.accumulate(np.where(changes, numbers, 0))
-    is_first = (numbers - last_change) % spacing == 0
+    step_numbers = np.arange(steps)
+    last_change = np.maximum.accumulate(np.where(changes, step_numbers, 0))
+    # Whether a step is the first of those for which a point stands.
+    is_first = (step_numbers - last_change) % spacing == 0
     point_steps = np.flatnonzero(is_first)
     if contact_changes is not None:
         last_steps = np.append(point_steps[1:], steps) - 1
         point_steps = (point_steps + last_steps) // 2
-    return point_steps, np.cumsum(is_first) - 1
+    point_of_step = np.cumsum(is_first) - 1
+    return point_steps, point_of_step
 
 
 def _repeat_coefficients(acting: ActiveEffects, count: int) -> ActiveEffects:

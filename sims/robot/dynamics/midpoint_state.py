@@ -62,8 +62,9 @@ class JointStates(NamedTuple):
 def predict_midpoint(x: Array, v: Array, a: Array, step: Array | float) -> tuple[Array, Array]:
     """Predict positions and velocities half a step later, for a constant acceleration.
 
-    Forces that depend on the state are evaluated there, which is accurate to second order. A
-    velocity that would change its sign keeps its value.
+    With the step h they are x + h v / 2 + h^2 a / 8 and v + h a / 2. Forces that depend on the
+    state are evaluated there, which is accurate to second order. A velocity that would change its
+    sign keeps its value.
 
     Args:
         x: positions.
@@ -103,10 +104,12 @@ class MidpointPredictor:
                 use.
         """
         self._batch = batch
+        # Whether MuJoCo's data has the forces of the end of a step after it, or of its beginning.
         self._forces_are_at_end = forces_are_at_step_end(batch.model)
         self._loaded, self._needs_loads = loaded, bool(loaded.any())
         self._is_first_step = True
         self.dof_indices = to_slice_if_contiguous(velocities)
+        # Pairs of a field and the columns of the joints, in the order x, v, a, drive, bias.
         self._fields = [(batch.bind("qpos")[: len(loaded)], to_slice_if_contiguous(positions))]
         for name in ("qvel", "qacc", "qfrc_actuator", "qfrc_bias"):
             self._fields.append((batch.bind(name)[: len(loaded)], self.dof_indices))
@@ -127,7 +130,9 @@ class MidpointPredictor:
         is_first_step, self._is_first_step = self._is_first_step, False
         a = np.zeros_like(a) if is_first_step else a
         if not self._needs_loads:
+            # No effect uses the loads, so those at the middle of the step need not be predicted.
             return JointStates(x, v, a, drive, bias, later_drive=drive, later_bias=bias)
+        # The loads are those on both sides of a transmission: drive and bias.
         loads, midpoint_loads = self._compute_transmission_loads(has_new_command, is_first_step)
         return JointStates(x, v, a, *loads, *midpoint_loads)
 
@@ -136,6 +141,7 @@ class MidpointPredictor:
     ) -> tuple[Array, Array]:
         """Return the transmission loads (2, L, D) at the beginning and at the middle of a step.
 
+        The two loads of a joint are the drive's force, and the bias force of gravity and motion.
         With the load d_k at the beginning of step k, that at its middle is extrapolated from the
         change over the previous step: d_k + (d_{k-1, end} - d_{k-1}) / 2 (2). Both loads of the
         difference have the same command, so that a jump with a command appears in d_k alone. MuJoCo
@@ -147,8 +153,10 @@ class MidpointPredictor:
             has_new_command: (L,) whether the command changes at the beginning of the step.
             is_first_step: whether it is the first step, in which both results are d_k, too.
         """
+        # d_{k-1, end}, which is also d_k without a new command; and d_{k-1}.
         end_loads = self._copy_forces()
         start_loads, previous_loads = end_loads, self._previous_loads
+        # Batch elements (L,) whose forces at the beginning of this step are not known.
         to_evaluate = self._loaded & has_new_command if self._forces_are_at_end else self._loaded
         # The fields hold the forces of the previous step's last evaluation. At the first step
         # MuJoCo has already evaluated the batch.
@@ -190,6 +198,7 @@ def compute_midpoint_loads(end_loads: Array, controls: Array) -> Array:
         controls: (S, nu) commands of the steps.
     """
     growth = np.diff(end_loads, axis=1, prepend=end_loads[:, :1])
+    # NaN differs from every command, so the first step counts as one with a jump.
     has_jump: Mask = np.any(np.diff(controls, axis=0, prepend=np.nan) != 0, axis=1)
     # Where the command jumps at the beginning of a step, the difference is not a growth within the
     # step. It is replaced by that of the next step, or by zero if the command jumps there, too.

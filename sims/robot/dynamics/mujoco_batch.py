@@ -82,8 +82,10 @@ class JointAddresses:
         series_joints = tuple(robot.joint(name) for name in robot.series)
         if both:
             joints = robot.file_joints + series_joints
+        elif series:
+            joints = series_joints
         else:
-            joints = series_joints if series else robot.file_joints
+            joints = robot.file_joints
         self.positions: IndexArray = np.array([j.position for j in joints], dtype=np.intp)
         self.velocities: IndexArray = np.array([j.velocity for j in joints], dtype=np.intp)
 
@@ -99,9 +101,10 @@ GRAVCOMP_PLACEHOLDER = 1e-200
 def make_batch_spec(robot: RobotModel) -> Any:
     """Make a mujoco.MjSpec with which masses and centres of mass can differ between batch elements.
 
-    MuJoCo stores less for a body that turns about its centre of mass, and then rejects changes of
-    its centre of mass; it also omits gravity compensation that is zero in the file. Here no body
-    counts as simple, and gravity compensation is always computed. The motion is the same.
+    MuJoCo stores less for a body that turns about its centre of mass (a simple body), and then
+    rejects changes of its centre of mass; it also omits gravity compensation that is zero in the
+    file. Here no body counts as simple, and gravity compensation is always computed. The motion is
+    the same.
     """
     spec = robot.spec.copy()
     for body in spec.bodies:
@@ -116,8 +119,8 @@ def make_batch_spec(robot: RobotModel) -> Any:
 def compile_batch_model(robot: RobotModel, derived: bool) -> Any:
     """Compile the model of a batch, with a sensor of the actuator force on each joint of the file.
 
-    A sensor shows the force at the beginning of a step for every integrator. The force in MuJoCo's
-    data would be that of the integrator's last evaluation within the step.
+    A sensor shows the force at the beginning of a step for every integrator. The field
+    `qfrc_actuator` of MuJoCo's data has the force of the integrator's last evaluation instead.
 
     Args:
         robot: robot to simulate.
@@ -159,13 +162,14 @@ def with_integrator_settings(robot: RobotModel, settings: Mapping[str, float]) -
         robot: robot whose model has options already.
         settings: wanted options by name, such as ``timestep``, as numbers.
     """
-    option = robot.compiled.opt
-    if all(getattr(option, name) == value for name, value in settings.items()):
+    compiled_options = robot.compiled.opt
+    if all(getattr(compiled_options, name) == value for name, value in settings.items()):
         return robot
     spec = robot.spec.copy()
     for name, value in settings.items():
-        # The options of a spec accept whole numbers only where the compiled options have them.
-        setattr(spec.option, name, type(getattr(option, name))(value))
+        # An option that is an integer in the compiled model must be set to an integer.
+        option_type = type(getattr(compiled_options, name))
+        setattr(spec.option, name, option_type(value))
     return replace(robot, spec=spec)
 
 
@@ -221,21 +225,26 @@ class MujocoBatch:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.drives = find_drive_sensors(model, robot)
         self.batch: Any = batch.Batch(model, count, 1)
-        # Fields of effects that add elements exist only in a model with these elements.
         field_names = {
             field
             for field_effect in MODEL_FIELD_EFFECTS.values()
             if derived or not field_effect.changes_derived_constants
             for field in field_effect.fields
         }
-        field_names |= set(USED_FIELDS) if robot.series else set()
-        field_names -= set() if robot.coupled else {COUPLING_FIELD}
-        field_names -= set() if model.npair else CONTACT_FIELDS
+        # Some fields belong to elements that effects add, and exist only in a model with these:
+        # joints in series, tendons of coupled drives, and pairs of geoms.
+        if robot.series:
+            field_names |= set(USED_FIELDS)
+        if not robot.coupled:
+            field_names -= {COUPLING_FIELD}
+        if not model.npair:
+            field_names -= CONTACT_FIELDS
         self.fields: dict[str, Any] = {
             name: self.batch.expand(name) for name in sorted(field_names)
         }
         # The values of the model file are restored before other effects are written.
         self._file_values = {name: values[:1].copy() for name, values in self.fields.items()}
+        # Fields that differ from the file since effects were written, or changed afterwards.
         self._changed_fields: set[str] = set()
         # Effects in the fields; None if the fields have been changed since they were written.
         self._written_effects: tuple[tuple[str, bytes], ...] | None = None
@@ -271,16 +280,18 @@ class MujocoBatch:
         written_effects = tuple((effect.name, c.tobytes()) for effect, c in acting)
         if written_effects == self._written_effects:
             return
-        # 1. Values of the file.
+        # 1. Values of the file. Constants that were derived from other values are not valid then.
         for name in self._changed_fields:
             self.fields[name][...] = self._file_values[name]
-        was_derived = any(self._needs_recomputed_constants(name) for name in self._changed_fields)
+        needs_constants = bool(self.robot.series) or any(
+            self._needs_recomputed_constants(name) for name in self._changed_fields
+        )
         self._changed_fields.clear()
-        needs_constants = was_derived or bool(self.robot.series)
         # 2. Effects; those in series with joints are written together.
         for effect, c in sorted(acting, key=lambda pair: get_write_order(pair[0].of)):
             if not c.any() or is_series_effect(effect):
                 continue
+            # An effect at one place has the name of the registered effect in `of`.
             field_effect = MODEL_FIELD_EFFECTS[effect.of or effect.name]
             field_effect.write(self.fields, self.robot, effect.place, c[:, :, 0])
             self._changed_fields.update(field_effect.fields)
@@ -291,17 +302,19 @@ class MujocoBatch:
             self._changed_fields.update(WRITTEN_FIELDS)
         # 3. Derived constants.
         if needs_constants:
-            self._recompute_constants(all((c == c[:, :1]).all() for _, c in acting))
+            elements_are_equal = all((c == c[:, :1]).all() for _, c in acting)
+            self._recompute_constants(elements_are_equal)
         if self.robot.series:
             # Parameters of compliant flanks depend on the derived inverse inertia.
             convert_flank_parameters(self.fields, self.robot)
-        self._loaded_friction = self.fields["dof_frictionloss"].copy()
+        # Dry friction of the model, to which `set_dry_friction` adds that of other effects.
+        self._model_friction = self.fields["dof_frictionloss"].copy()
         self._written_effects = written_effects
 
     def _recompute_constants(self, elements_are_equal: bool) -> None:
         """Let MuJoCo recompute the constants that it derives from the changed fields.
 
-        If all elements are equal, it does so for the first one, whose fields are copied.
+        If all batch elements are equal, it does so for the first one, whose fields are copied.
 
         Args:
             elements_are_equal: whether all elements have the same effects, so that the constants of
@@ -309,11 +322,12 @@ class MujocoBatch:
         """
         from mujoco.batch import MODEL_FIELDS
 
-        # MuJoCo before 4.0, the newest for Python 3.10, does not tell which fields it has changed.
+        # MuJoCo before 4.0, the newest for Python 3.10, does not tell which fields are expanded.
         if not elements_are_equal or not hasattr(self.batch, "expanded"):
             self.batch.set_const()
             return
         self.batch.set_const([0])
+        # An expanded field has a row for each batch element; all others are common to them.
         for name in MODEL_FIELDS:
             if self.batch.expanded(name) is not None:
                 values = self.batch.expand(name)
@@ -363,7 +377,8 @@ class MujocoBatch:
         series = self.series_joints
         series_positions = np.zeros((element_count, series.positions.size))
         if series_positions.size:
-            # The load on a joint in series is that of springs, dampers, gravity and motion.
+            # The load on a joint in series is that of springs, dampers, gravity and motion. MuJoCo
+            # subtracts the bias forces of gravity and motion.
             passive, bias = self.batch.bind("qfrc_passive"), self.batch.bind("qfrc_bias")
             self.batch.forward(self.get_element_ids(element_count))
             loads = (passive - bias)[:element_count, series.velocities].T
@@ -376,10 +391,12 @@ class MujocoBatch:
     def map_forces(self, forces: Array) -> Array:
         """Map generalised forces (..., nv) of the file's model to this batch's model.
 
-        The model of the batch may have further joints in series, on which no force acts.
+        The model of the batch may have further joints in series, on which no force acts. The result
+        has a column for each degree of freedom of this model.
         """
         if self.model.nv == forces.shape[-1]:
             return forces
+        # Degrees of freedom of the file, in the same order as in the file's model.
         file_dofs = np.setdiff1d(np.arange(self.model.nv), self.series_joints.velocities)
         result = np.zeros((*forces.shape[:-1], self.model.nv))
         result[..., file_dofs] = forces
@@ -418,7 +435,7 @@ class MujocoBatch:
         """
         import mujoco
 
-        # `input_kinds` tells MuJoCo of which parts its inputs consist.
+        # `input_kinds` tells MuJoCo of which parts its inputs consist: controls, and forces if any.
         state = mujoco.mjtState
         input_kinds = int(state.mjSTATE_CTRL)
         applies_forces = before_call is not None or bool(forces.any())
@@ -463,6 +480,7 @@ class MujocoBatch:
         if off is not None and off.any():
             ranges, stretches = self.force_ranges(), iterate_constant_stretches(off)
         for stretch in stretches:
+            # The switches at the first step of a stretch hold for all of its steps.
             if ranges is not None and off is not None:
                 ranges.write(off[:, stretch.start])
             for begin in range(stretch.start, stretch.stop, steps_per_call):
@@ -487,6 +505,7 @@ class MujocoBatch:
         """
         robot = self.robot
         stiffness = np.zeros((self.count, len(joints.velocities)))
+        # Column of the result, by the address of the joint's velocity in qvel.
         column_of_address = {int(address): i for i, address in enumerate(joints.velocities)}
         for actuator in robot.actuators:
             if actuator.kind == "position" and actuator.joint is not None:
@@ -500,14 +519,14 @@ class MujocoBatch:
         """Set the dry friction at one joint of the first n batch elements.
 
         It is the friction of the model with the effects that are written into it, plus `limit`.
-        So a limit that was set before is replaced.
+        So a limit of an earlier call is replaced.
 
         Args:
             n: number of batch elements.
             dof: index of the joint's velocity.
-            limit: (n,) friction limits to add.
+            limit: (n,) friction limits to add, N or N m.
         """
-        self.fields["dof_frictionloss"][:n, dof] = self._loaded_friction[:n, dof] + limit
+        self.fields["dof_frictionloss"][:n, dof] = self._model_friction[:n, dof] + limit
         self.prepare_dry_friction(slice(n), dof)
 
     def prepare_dry_friction(self, batch_indices: Any, dofs: Any) -> None:
@@ -520,6 +539,7 @@ class MujocoBatch:
             batch_indices: NumPy index of the batch elements.
             dofs: NumPy index of the joints' velocities.
         """
+        # These are the fields of dry friction, whatever the effect.
         self._mark_changed(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
         write_friction_form(self.fields, self.robot, batch_indices, dofs)
 
@@ -568,16 +588,18 @@ class BatchCache:
     def __init__(self, robot: RobotModel, limit: int = CACHE_BYTES) -> None:
         """Start with the robot's own model and no batch; batches are made on first request.
 
-        Elements without influence on the motion are removed here, so that batches take less
-        memory.
+        Parts of the model without influence on the motion, such as textures, are removed here, so
+        that batches take less memory.
 
         Args:
             robot: robot as read from its model file.
             limit: maximum memory in bytes, see `CACHE_BYTES`.
         """
         self._limit = limit
+        # The robot's own model, and those with added elements, with the last used one at the end.
         self._own = _Variant(strip_assets(robot))
         self._extended: dict[AddedElements, _Variant] = {}
+        # Reasons why MuJoCo rejects a model, by the added elements.
         self._refused: dict[AddedElements, str] = {}
 
     @property
@@ -613,24 +635,29 @@ class BatchCache:
                 self._evict_unused_variants()
             return variant.batches[key]
         except ValueError as error:
-            if not added:  # The robot's own model has compiled before.
+            # The robot's own model has compiled when its file was read, so this error has another
+            # cause.
+            if not added:
                 raise
             effects = ", ".join(f"{effect}@{place}" if place else effect for place, effect in added)
-            said = f"{effects}: MuJoCo does not compile the model: {format_mujoco_error(error)}"
-            self._refused[added] = said
-            sys.stderr.write(f"simgap: not simulated: {said}\n")
-            raise RefusedModelError(said) from None
+            reason = f"{effects}: MuJoCo does not compile the model: {format_mujoco_error(error)}"
+            self._refused[added] = reason
+            sys.stderr.write(f"simgap: not simulated: {reason}\n")
+            raise RefusedModelError(reason) from None
 
     def _get_variant(self, added: AddedElements) -> _Variant:
         """Return the robot with added elements and its batches, and mark it as most recently used.
 
         Without added elements, this is the robot's own model, which is never dropped from
         the cache. Otherwise it is made if the cache does not have it.
+
+        Args:
+            added: the elements, as pairs of place and effect.
         """
         if not added:
             return self._own
+        # The dictionary is ordered by last use: the variant is taken out, and goes to the end.
         variant = self._extended.pop(added, None) or _Variant(add_elements(self._own.robot, added))
-        # The dictionary is ordered by last use, so the variant goes to the end.
         self._extended[added] = variant
         return variant
 

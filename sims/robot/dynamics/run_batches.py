@@ -61,13 +61,18 @@ def list_last_read_times(work: RobotRunBatch) -> Array:
     The simulation must last until then. Without effects on sensors it is the last time stamp. If
     an effect makes the clock of the recording slow, the true time is later.
 
+    Args:
+        work: batch elements of the run, with their active effects.
+
     Returns:
-        An array (1,) with the time, which is limited as `MAX_DURATION_FACTOR` states.
+        An array (1,) with the time, which is at most `MAX_DURATION_FACTOR` times the last time
+        stamp plus `MAX_EXTRA_SECONDS`.
     """
     last_stamp = float(work.times[-1])
     latest = last_stamp
     for effect, c in work.acting:
         if isinstance(effect, Sensor):
+            # True times of the last stamp in all n batch elements, (n, 1).
             true_times = effect.times(c, np.full(c[0].shape, last_stamp))
             latest = max(latest, float(np.max(true_times)))
     # Implausible values that a fit tries must not cost thousands of steps.
@@ -116,6 +121,9 @@ class BatchInputs(NamedTuple):
         The batch elements of the runs follow one another. All runs then have as many steps as the
         longest; shorter ones repeat their last inputs, and the additional steps are ignored
         afterwards.
+
+        Args:
+            parts: inputs of each run, with arrays (n, S, ...) of its own n elements and S steps.
         """
         if len(parts) == 1:
             return parts[0]
@@ -157,8 +165,9 @@ def group_by_run(runs: ScenarioGroups, batch_indices: IndexArray) -> list[tuple[
     if not batch_indices.size:
         return []
     run_numbers = runs.scenario_index[batch_indices]
-    begins_run = np.flatnonzero(np.diff(run_numbers)) + 1
-    groups = np.split(batch_indices, begins_run)
+    # Positions at which another run begins.
+    run_begins = np.flatnonzero(np.diff(run_numbers)) + 1
+    groups = np.split(batch_indices, run_begins)
     return [(int(runs.scenario_index[group[0]]), group) for group in groups]
 
 
@@ -183,10 +192,15 @@ class BatchResult(NamedTuple):
 
     def select(self, batch_indices: slice) -> BatchResult:
         """Return the results of some batch elements."""
-        fields = {name: values[batch_indices] for name, values in self.fields.items()}
-        series = self.series[0][batch_indices], self.series[1][batch_indices]
-        rest = self.initial_activations[batch_indices], self.failed[batch_indices], series
-        return BatchResult(self.x[batch_indices], self.v[batch_indices], fields, *rest)
+        series_x, series_v = self.series
+        return BatchResult(
+            x=self.x[batch_indices],
+            v=self.v[batch_indices],
+            fields={name: values[batch_indices] for name, values in self.fields.items()},
+            initial_activations=self.initial_activations[batch_indices],
+            failed=self.failed[batch_indices],
+            series=(series_x[batch_indices], series_v[batch_indices]),
+        )
 
 
 def split_into_batches(
@@ -194,7 +208,9 @@ def split_into_batches(
 ) -> Iterator[IndexArray]:
     """Yield the indices of the elements of each batch, which are simulated together.
 
-    Elements are sorted by run, so that data common to a run are computed once for each batch.
+    Only elements whose effects need the same model and the same kind of simulation are in one batch
+    (`group_batch_elements`). Elements are sorted by run, so that data common to a run are computed
+    once for each batch. The batches of a group are of nearly equal size.
 
     Args:
         acting: active effects, with coefficients (K, L, 1).
@@ -217,12 +233,14 @@ def group_batch_elements(acting: ActiveEffects, count: int) -> Iterator[IndexArr
         acting: active effects, with coefficients (K, L, 1).
         count: number L of batch elements.
     """
+    # For each of the L elements, whether it has such an effect.
     has_step_forces = find_active_elements(acting, count, is_evaluated_per_step)
     has_changed_constants = find_active_elements(acting, count, changes_derived_constants)
+    # Groups with the same added elements are divided by these two properties.
     for indices in map(np.array, group_by_added_elements(acting, count).values()):
-        for with_forces, with_constants in product((False, True), repeat=2):
-            is_in_group = (has_step_forces[indices] == with_forces) & (
-                has_changed_constants[indices] == with_constants
+        for step_forces, changed_constants in product((False, True), repeat=2):
+            is_in_group = (has_step_forces[indices] == step_forces) & (
+                has_changed_constants[indices] == changed_constants
             )
             if is_in_group.any():
                 yield indices[is_in_group]

@@ -11,8 +11,6 @@ with unknown slope is interpolated linearly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,7 +38,8 @@ def sample_readings(
     2. Where a filter acts, replace them by samples of the filtered signal.
     3. Change each reading (effects such as a bias or a gain).
 
-    Shapes: L batch elements, S steps, T samples.
+    Shapes: L batch elements, S steps, T samples. Effects have coefficients (K, L, 1), and are
+    inactive in batch elements where all K of them are zero.
 
     Args:
         values: (L, S + 1) values at the start and at the end of each step.
@@ -58,13 +57,17 @@ def sample_readings(
         assert isinstance(effect, Sensor)
         if type(effect).times is not Sensor.times:  # The effect shifts times.
             instants = np.where(is_active(c), effect.times(c, instants), instants)
+    # Before the start and after the end of the simulation, the values there are read.
     instants = np.clip(instants, 0.0, step_ends[-1])
     result = _interpolate(values, slopes, step, instants)
     # 2. Filters. They need the signal at all steps, not only at the samples.
-    for filtered_elements, filters in _iterate_filters(sensors):
+    filtered_elements, filters = _select_active_filters(sensors)
+    if filtered_elements.size:
         grid = np.broadcast_to(step_ends, (filtered_elements.size, count))
-        steps = np.diff(grid, axis=1, prepend=0.0)
-        filtered = apply_sensor_effects(filters, values[filtered_elements], steps, grid, clock)
+        step_lengths = np.diff(grid, axis=1, prepend=0.0)
+        filtered = apply_sensor_effects(
+            filters, values[filtered_elements], step_lengths, grid, clock
+        )
         # The slope of a filtered signal is unknown.
         result[filtered_elements] = _interpolate(filtered, None, step, instants[filtered_elements])
     # 3. Changes of readings.
@@ -92,10 +95,11 @@ def apply_effects_to_readings(
     stamps = np.broadcast_to(times, readings.shape)
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
-        # Filters, and effects that only shift times, have been applied before.
+        # Filters are not applied here. Effects that do not override `read` only shift times.
         if effect.filters or type(effect).read is Sensor.read:
             continue
         active_elements = np.flatnonzero(is_active(c))
+        # The step lengths of the signal are zero: only filters need them.
         signal = Signal(
             readings[active_elements],
             np.zeros_like(readings[active_elements]),
@@ -132,21 +136,25 @@ def preserves_time(sensors: ActiveEffects) -> bool:
     return all(type(e).times is Sensor.times and not e.filters for e in sensor_effects)
 
 
-def _iterate_filters(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp], ActiveEffects]]:
-    """Yield once the batch elements with an active filter, and the filters there; or nothing.
+def _select_active_filters(sensors: ActiveEffects) -> tuple[NDArray[np.intp], ActiveEffects]:
+    """Return the batch elements with an active filter, and the filters restricted to them.
 
     Args:
         sensors: sensor effects with coefficients (K, L, 1); those that filter nothing are ignored.
+
+    Returns:
+        Indices (n,) of the batch elements, and the filters with coefficients (K, n, 1).
     """
     filters = tuple((e, c) for e, c in sensors if needs_every_step(e))
+    if not filters:
+        return np.zeros(0, np.intp), ()
     is_filtered = [is_active(c)[:, 0] for _, c in filters]
-    batch_indices = np.flatnonzero(np.any(is_filtered, axis=0)) if filters else np.zeros(0, np.intp)
-    if batch_indices.size:
-        yield batch_indices, tuple((e, c[:, batch_indices]) for e, c in filters)
+    batch_indices = np.flatnonzero(np.any(is_filtered, axis=0))
+    return batch_indices, tuple((e, c[:, batch_indices]) for e, c in filters)
 
 
 def _interpolate(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
-    """Interpolate values (L, T), which are known at the ends of S steps, at the times of T samples.
+    """Interpolate a channel between the ends of S steps, at T times of each of L batch elements.
 
     Without slopes, the values are interpolated linearly. Otherwise, with values a, b and slopes
     a', b' at the ends of a step of length h, the value at the fraction s of the step is the cubic
@@ -155,10 +163,13 @@ def _interpolate(values: Array, slopes: Array | None, step: float, instants: Arr
         (1 + 2s)(1 - s)^2 a + s(1 - s)^2 h a' + s^2 (3 - 2s) b - s^2 (1 - s) h b'
 
     Args:
-        values: (L, S + 1) values at the ends of steps.
+        values: (L, S + 1) values at the start and at the ends of the steps.
         slopes: (L, S + 1) derivatives per second; None if they are unknown.
         step: step length in seconds.
         instants: (L, T) times in seconds since the first value.
+
+    Returns:
+        Values (L, T).
     """
     position_in_steps = instants / step
     nearest = np.rint(position_in_steps)
@@ -169,16 +180,16 @@ def _interpolate(values: Array, slopes: Array | None, step: float, instants: Arr
     # A sample at the end of a step returns the stored value bit for bit, whatever times other batch
     # elements use.
     position_in_steps = np.where(is_at_step_end, nearest, position_in_steps)
-    last = values.shape[1] - 2
-    below = np.clip(np.floor(position_in_steps), 0, max(last, 0)).astype(np.intp)
+    last_step = values.shape[1] - 2  # S + 1 values belong to the steps 0 to S - 1
+    below = np.clip(np.floor(position_in_steps), 0, max(last_step, 0)).astype(np.intp)
     s = position_in_steps - below
     a = np.take_along_axis(values, below, axis=1)
     b = np.take_along_axis(values, below + 1, axis=1)
     if slopes is None:
         linear: Array = a + s * (b - a)
         return linear
-    start_change = step * np.take_along_axis(slopes, below, axis=1)
-    end_change = step * np.take_along_axis(slopes, below + 1, axis=1)
+    start_change = step * np.take_along_axis(slopes, below, axis=1)  # h a'
+    end_change = step * np.take_along_axis(slopes, below + 1, axis=1)  # h b'
     rest = 1.0 - s
     # (1)
     cubic: Array = (

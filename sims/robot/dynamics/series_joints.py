@@ -86,7 +86,11 @@ def make_series_joint_name(joint: str, effects: Collection[str]) -> str:
         joint: name of the joint with which it is in series.
         effects: names of the effects that it combines.
     """
-    kind = next(iter(effects)).rpartition(".")[2] if len(effects) == 1 else "transmission"
+    if len(effects) == 1:
+        (effect,) = effects
+        kind = effect.rpartition(".")[2]  # the part after the dot
+    else:
+        kind = "transmission"
     return f"{joint}_{kind}"
 
 
@@ -118,13 +122,18 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
 
     Args:
         robot: robot as read from its model file.
-        added: pairs of a joint, the last one of its body, and an effect in series with it.
+        added: pairs of a joint, the last one of its body, and the name of an effect in series with
+            it, such as ``joint.flexibility``. A joint with several effects gets one second joint.
+
+    Returns:
+        The robot, whose `series` has the inertia about each added joint by name, in kg or kg m^2.
     """
     import mujoco
 
     spec = robot.spec.copy()
     inertias = _compute_joint_inertias(robot)
-    for name, effects in group_by_joint(added).items():
+    effects_by_joint = group_by_joint(added)
+    for name, effects in effects_by_joint.items():
         first_joint = spec.joint(name)
         second_joint = first_joint.parent.add_joint(
             name=make_series_joint_name(name, effects),
@@ -138,9 +147,9 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
         second_joint.springdamper = (0.0, 0.0)
         second_joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         has_backlash = any(effect.endswith("backlash") for effect in effects)
-        limited = mujoco.mjtLimited
-        second_joint.limited = limited.mjLIMITED_TRUE if has_backlash else limited.mjLIMITED_FALSE
+        second_joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
         if has_backlash:
+            second_joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
             second_joint.range = (-1.0, 1.0)  # a placeholder, which lets the model compile
         # The simulation writes the actual armature; this minimum makes the model compile.
         first_joint.armature = max(first_joint.armature, COMPILE_INERTIA_SHARE * inertias[name])
@@ -148,8 +157,8 @@ def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
     for key in list(spec.keys):
         spec.delete(key)
     series = {
-        make_series_joint_name(name, own): inertias[name]
-        for name, own in group_by_joint(added).items()
+        make_series_joint_name(name, effects): inertias[name]
+        for name, effects in effects_by_joint.items()
     }
     return replace(robot, spec=spec, series=series)
 
@@ -182,11 +191,12 @@ def write_series_effects(
     """
     elements_by_joint: dict[str, list[SeriesElement]] = {}
     for effect, c in acting:
+        # Such an effect is off where its first coefficient is not above zero.
         if not is_series_effect(effect) or not (c[0] > 0).any():
             continue
-        numbers = dict(
-            zip((coefficient.name for coefficient in effect.coefficients), c[:, :, 0], strict=True)
-        )
+        coefficient_names = [coefficient.name for coefficient in effect.coefficients]
+        numbers = dict(zip(coefficient_names, c[:, :, 0], strict=True))
+        # The place of the effect is the name of its joint.
         elements_by_joint.setdefault(effect.place, []).append(
             make_series_element(type(effect), numbers)
         )
@@ -198,11 +208,12 @@ def make_series_element(kind: type[Effect], numbers: Mapping[str, Array]) -> Ser
     """Make the element in series with a joint, a spring or a gap, from an effect's coefficients.
 
     Args:
-        kind: class of the effect.
+        kind: class of the effect, for which `is_series_effect` is true.
         numbers: coefficients (L,) of L batch elements by name; missing ones are zero.
     """
     assert issubclass(kind, HiddenStateEffect)
     zeros = np.zeros_like(next(iter(numbers.values())))
+    # `between` are the coefficients of an element whose both sides are known, as in a robot.
     values = [numbers.get(coefficient.name, zeros) for coefficient in kind.between]
     return kind().element(np.stack(values))
 
@@ -236,26 +247,29 @@ def write_series_element(
     """
     second = robot.joint(find_series_joint(robot, place))
     inertia = robot.series[second.name]
-    # Inertia of the drive.
+    # Inertia of the drive, (L,).
     dof = robot.joint(place).velocity
-    file_armature = fields["dof_armature"][:, dof]
-    drive = np.maximum(file_armature + element.drive * inertia, MIN_DRIVE_INERTIA_SHARE * inertia)
+    armature = fields["dof_armature"][:, dof]
+    drive = np.maximum(armature + element.drive * inertia, MIN_DRIVE_INERTIA_SHARE * inertia)
     fields["dof_armature"][:, dof] = drive
     # Stiffness and damping of a spring, or of compliant flanks. Fields may have other options than
     # the model.
     option = robot.compiled.opt
     step = float(fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep)
     integrator = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
+    # Runge-Kutta 4 treats damping explicitly.
     stiffness, damping = _limit_to_stable_values(
-        element, inertia, drive, step, int(integrator) == RK4_INTEGRATOR_ID
+        element, inertia, drive, step, explicit=int(integrator) == RK4_INTEGRATOR_ID
     )
     is_compliant = is_compliant_flank(element)
     fields["jnt_stiffness"][:, second.id] = np.where(is_compliant, 0.0, stiffness)
     fields["dof_damping"][:, second.velocity] = np.where(is_compliant, 0.0, damping)
     # Limits of flanks.
     if "jnt_range" in fields:
-        half = 0.5 * element.gap
-        fields["jnt_range"][:, second.id] = np.stack([-half, half], axis=1)
+        half_gap = 0.5 * element.gap
+        fields["jnt_range"][:, second.id] = np.stack([-half_gap, half_gap], axis=1)
+        # Negative values of `solref` mean a stiffness and a damping, instead of a time constant and
+        # a damping ratio. They are converted to MuJoCo's units by `convert_flank_parameters`.
         compliant_solref = np.stack([-stiffness, -damping], axis=1)
         fields["jnt_solref"][:, second.id] = np.where(
             is_compliant[:, None], compliant_solref, _compute_rigid_solref(step)
@@ -274,10 +288,10 @@ def convert_flank_parameters(fields: Mapping[str, Any], robot: RobotModel) -> No
     """Convert stiffness and damping of compliant flanks to `solref` of MuJoCo's joint limit.
 
     A limit with `solref` (-K s, -C s) and impedance s exerts -(K e + C d') / (A + R) with
-    R = (1 - s) A0 / s (6), where e is the deflection beyond the gap, A the inverse inertia along
-    the joint, and A0 its value in the pose of the file. At the small s that is used here, this is
-    -(K e + C d') s / A0. So stiffness and damping, which `write_series_element` has written, are
-    multiplied by A0, which MuJoCo has derived since.
+    R = (1 - s) A0 / s (6), where d is the deflection between drive and links, e its part beyond
+    the gap, A the inverse inertia along the joint, and A0 its value in the pose of the file. At the
+    small s that is used here, this is -(K e + C d') s / A0. So stiffness and damping, which
+    `write_series_element` has written, are multiplied by A0, which MuJoCo has derived since.
 
     Args:
         fields: model fields of the batch elements, changed in place.
@@ -285,9 +299,10 @@ def convert_flank_parameters(fields: Mapping[str, Any], robot: RobotModel) -> No
     """
     for name in robot.series:
         second = robot.joint(name)
+        # Compliant flanks are recognised by the parameter that was written for them.
         is_compliant = fields["jnt_solimp"][:, second.id, 0] == COMPLIANT_FLANK_SOLIMP[0]
-        inverse = fields["dof_invweight0"][is_compliant, second.velocity, None]
-        fields["jnt_solref"][is_compliant, second.id] *= inverse  # (6)
+        inverse_inertia = fields["dof_invweight0"][is_compliant, second.velocity, None]  # A0
+        fields["jnt_solref"][is_compliant, second.id] *= inverse_inertia
 
 
 def _compute_rigid_solref(step: float) -> tuple[float, float]:
@@ -314,24 +329,26 @@ def prepare_flanks_for_file(
     """
     spec, option = robot.spec.copy(), (model or robot.compiled).opt
     joints = {joint.name: joint for joint in spec.joints}
-    step, explicit = float(option.timestep), int(option.integrator) == RK4_INTEGRATOR_ID
+    step = float(option.timestep)
+    is_explicit = int(option.integrator) == RK4_INTEGRATOR_ID
     for place, element in elements.items():
         joint = joints[find_series_joint(robot, place)]
-        half = 0.5 * float(element.gap[0])
-        if not half:  # a spring without a gap
+        half_gap = 0.5 * float(element.gap[0])
+        if not half_gap:  # a spring without a gap
             continue
         is_in_degrees = robot.joint(joint.name).kind == "hinge" and spec.compiler.degree
-        half = float(np.rad2deg(half)) if is_in_degrees else half
-        joint.range = (-half, half)
+        half_gap = float(np.rad2deg(half_gap)) if is_in_degrees else half_gap
+        joint.range = (-half_gap, half_gap)
         joint.solref_limit, joint.solimp_limit = _compute_rigid_solref(step), RIGID_FLANK_SOLIMP
         if model is not None and is_compliant_flank(element)[0]:
-            inertia, drive = robot.series[joint.name], model.dof_armature
-            drive = drive[[robot.joint(place).velocity]]
+            inertia = robot.series[joint.name]
+            drive_inertia = model.dof_armature[[robot.joint(place).velocity]]  # (1,)
             (stiffness,), (damping,) = _limit_to_stable_values(
-                element, inertia, drive, step, explicit
+                element, inertia, drive_inertia, step, is_explicit
             )
-            inverse = model.dof_invweight0[robot.joint(joint.name).velocity]
-            joint.solref_limit = -np.array([stiffness, damping]) * inverse  # (6)
+            # Negative values mean a stiffness and a damping, per unit of inertia (6).
+            inverse_inertia = model.dof_invweight0[robot.joint(joint.name).velocity]
+            joint.solref_limit = -np.array([stiffness, damping]) * inverse_inertia
             joint.solimp_limit = COMPLIANT_FLANK_SOLIMP
     return replace(robot, spec=spec)
 
@@ -351,22 +368,26 @@ def _limit_to_stable_values(
     Args:
         elements: elements (L,) in series; their damping is a damping ratio.
         inertia: inertia of the joint in kg m^2 or kg.
-        drive: (L,) inertia of the drive.
+        drive: (L,) inertia of the drive in the same unit.
         step: time step in seconds.
         explicit: whether the integrator treats damping explicitly.
 
     Returns:
         Stiffness in N m/rad or N/m, and damping in N m s/rad or N s/m.
     """
+    # Drive and links swing against each other: their squared angular frequency is the stiffness
+    # times the sum of both inverse inertias.
     inverse_inertia = 1.0 / drive + 1.0 / inertia
-    max_stiffness = ((MAX_PHASE_RK4 if explicit else MAX_PHASE) / step) ** 2 / inverse_inertia
+    max_phase = MAX_PHASE_RK4 if explicit else MAX_PHASE
+    max_stiffness = (max_phase / step) ** 2 / inverse_inertia
     stiffness = np.minimum(elements.stiffness, max_stiffness)
     damping = 2.0 * elements.damping * np.sqrt(stiffness * inertia)
     stable_damping = np.minimum(damping, MAX_PHASE / step / inverse_inertia)
     if explicit:
         return stiffness, stable_damping
-    # Implicit damping makes a spring implicit, too, by the backward Euler rule k (d + h d'): the
-    # stiffness beyond the limit, times h, is added to the damping.
+    # Implicit damping makes a spring implicit, too, by the backward Euler rule k (d + h d') with
+    # the deflection d and the step h: the stiffness beyond the limit, times h, is added to the
+    # damping.
     is_compliant = is_compliant_flank(elements)
     implicit_damping = damping + step * (elements.stiffness - stiffness)
     return np.where(is_compliant, stiffness, elements.stiffness), np.where(
@@ -393,16 +414,17 @@ def compute_rest_positions(
     positions = []
     for (name, inertia), load in zip(robot.series.items(), loads, strict=True):
         second, n = robot.joint(name), len(load)
-        stiffness = fields["jnt_stiffness"][:n, second.id]
+        # Stiffness of the spring, or of compliant flanks; zero for rigid flanks.
+        spring_stiffness = fields["jnt_stiffness"][:n, second.id]
         is_compliant = fields["jnt_solimp"][:n, second.id, 0] == COMPLIANT_FLANK_SOLIMP[0]
-        inverse = fields["dof_invweight0"][:n, second.velocity]
-        effective_stiffness = np.where(
-            is_compliant, -fields["jnt_solref"][:n, second.id, 0] / inverse, stiffness
-        )  # (6)
-        half = fields["jnt_range"][:n, second.id, 1]  # half the gap
-        on_flank = half * np.clip(load / (UNLOADED_FORCE_SHARE * inertia), -1.0, 1.0)
-        deflection = np.where(
-            effective_stiffness > 0, load / np.maximum(effective_stiffness, 1e-300), 0.0
-        )
-        positions.append(deflection + np.where(is_compliant | (stiffness <= 0), on_flank, 0.0))
+        inverse_inertia = fields["dof_invweight0"][:n, second.velocity]
+        flank_stiffness = -fields["jnt_solref"][:n, second.id, 0] / inverse_inertia
+        stiffness = np.where(is_compliant, flank_stiffness, spring_stiffness)
+        # Position in the gap: at a flank, or between the flanks for a very small load.
+        half_gap = fields["jnt_range"][:n, second.id, 1]
+        in_gap = half_gap * np.clip(load / (UNLOADED_FORCE_SHARE * inertia), -1.0, 1.0)
+        has_gap = is_compliant | (spring_stiffness <= 0)
+        # The tiny divisor is never used; it avoids a division by zero where there is no spring.
+        deflection = np.where(stiffness > 0, load / np.maximum(stiffness, 1e-300), 0.0)
+        positions.append(deflection + np.where(has_gap, in_gap, 0.0))
     return positions

@@ -50,7 +50,15 @@ def find_stiff_force_limits(model: Any) -> ForceLimits:
     limit the servo loses this damping, which changes the state abruptly. A linearised model does
     not contain such jumps, so its user must know where they can occur. There are two kinds of
     limits, on the force of an actuator and on the total actuator force at a joint. With other
-    integrators nothing jumps, and the result is empty.
+    integrators nothing jumps, and the result is empty. A servo is stiff if its velocity gain times
+    the time step is a considerable part of the inertia (`MIN_STIFF_RATIO`).
+
+    Args:
+        model: the mujoco.MjModel.
+
+    Returns:
+        For each limit, the field with the limited force, the force from which the limit counts as
+        reached, and the jumps (nv,) of the positions.
     """
     import mujoco
 
@@ -59,7 +67,7 @@ def find_stiff_force_limits(model: Any) -> ForceLimits:
     outputs: list[tuple[str, int]] = []  # field of MuJoCo's data and column
     limits: list[float] = []  # in units of the field
     joint_limits: list[tuple[int, float]] = []  # degree of freedom, and limit of its force
-    gains = np.zeros(model.nv)
+    gains = np.zeros(model.nv)  # velocity gains of all servos at each degree of freedom
     if model.opt.integrator in implicit:
         for actuator_id in range(model.nu):
             dof = _find_dof(model, actuator_id)

@@ -73,7 +73,7 @@ def step_with_forces(
     Returns:
         Recorded fields (n, S, ...) by name.
     """
-    # 1. Dry friction.
+    # 1. Dry friction: (n, D) whether effects add it, and the friction of the model without them.
     n, has_friction = len(controls), step_forces.has_dry_friction
     positions, dofs = step_forces.addresses.positions, step_forces.addresses.velocities
     file_friction = mujoco_batch.fields["dof_frictionloss"][:n, dofs].copy()
@@ -96,7 +96,7 @@ def step_with_forces(
                 controls, forces, record, before_call=contexts.reset_accelerations
             )
     # 3. Single steps.
-    loss = mujoco_batch.fields["dof_frictionloss"]
+    friction_field = mujoco_batch.fields["dof_frictionloss"]
     all_forces = forces.copy()
     # Where a control changes, or an actuator is switched, at the beginning of a step (n, S).
     changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
@@ -106,11 +106,12 @@ def step_with_forces(
         """Evaluate the effects at the predicted middle of step k, and add their forces to it."""
         ctrl[:n] = controls[:, k]
         if k == 0:
+            # Later joint states are those of the preceding step.
             mujoco_batch.batch.forward(mujoco_batch.get_element_ids(n))
         force, limit = step_forces.compute(k, predictor.read_joint_states(changes[:, k]))
         all_forces[:, k, dofs] += force
         if has_friction.any():
-            loss[:n, predictor.dof_indices] = file_friction + np.maximum(limit, 0.0)
+            friction_field[:n, predictor.dof_indices] = file_friction + np.maximum(limit, 0.0)
 
     return mujoco_batch.step(controls, all_forces, record, off, set_forces, steps_per_call=1)
 
@@ -162,6 +163,8 @@ class _CallbackContexts:
             steps: number of steps S.
         """
         self._mujoco_batch = mujoco_batch
+        # The program computes with registers. Its outputs are the numbers of the registers with
+        # forces, limits of dry friction, and hidden states.
         layout, prepared = step_forces.layout, step_forces.prepared
         ((force, limit, next_states),) = prepared.program.outputs
         self._dofs = step_forces.addresses.velocities
@@ -185,14 +188,16 @@ class _CallbackContexts:
         if has_friction.any():
             # MuJoCo makes a constraint only where the model has dry friction.
             batch_indices, joint_indices = np.nonzero(has_friction)
-            loss = mujoco_batch.fields["dof_frictionloss"]
+            friction = mujoco_batch.fields["dof_frictionloss"]
             dofs = self._dofs[joint_indices]
-            loss[batch_indices, dofs] = np.maximum(loss[batch_indices, dofs], MIN_FRICTION)
-            friction_rows = (loss > 0).sum(axis=1).tolist()
+            friction[batch_indices, dofs] = np.maximum(friction[batch_indices, dofs], MIN_FRICTION)
+            friction_rows = (friction > 0).sum(axis=1).tolist()
         else:
             friction_rows = [0] * len(losses)
+        # The instructions from `begin` to `end` are those of a step; those before prepare elements.
         _, begin, end, _ = prepared.program.ends.tolist()
         common = layout._asdict() | {name: values.ctypes.data for name, values in shared.items()}
+        is_rk4 = mujoco_batch.model.opt.integrator == RK4_INTEGRATOR_ID
         table = []
         for batch_index in range(len(losses)):
             registers = np.ascontiguousarray(prepared.r[:, batch_index : batch_index + 1])
@@ -200,6 +205,7 @@ class _CallbackContexts:
                 "registers": registers,
                 "losses": np.ascontiguousarray(losses[batch_index]),
                 "input_values": np.ascontiguousarray(inputs[:, :, batch_index]),
+                # Memory for limits and hidden states within a step, of at least one number.
                 "scratch": np.zeros(joints + states + 1),
             }
             self._registers.append(registers)
@@ -217,9 +223,9 @@ class _CallbackContexts:
                 states=states,
                 inputs=inputs.shape[1],
                 steps=steps,
-                evaluations_per_step=4
-                if mujoco_batch.model.opt.integrator == RK4_INTEGRATOR_ID
-                else 1,
+                evaluations_per_step=4 if is_rk4 else 1,
+                # The callback changes these two: evaluations so far, and whether MuJoCo's data has
+                # the previous acceleration.
                 evaluation=0,
                 has_acceleration=0,
             )
@@ -230,20 +236,25 @@ class _CallbackContexts:
     def use(self, callback: Any) -> Iterator[None]:
         """Have MuJoCo call the callback with these contexts in a `with` block.
 
-        The address of an element's context is stored in its user data.
+        The callback is that of the whole process. It finds the context of a batch element by its
+        address, the first number of the element's user data.
+
+        Args:
+            callback: compiled callback, as from `find_callback`.
         """
         import mujoco
 
-        user = self._mujoco_batch.batch.bind("userdata")
+        user_data = self._mujoco_batch.batch.bind("userdata")
+        # The table has one row for each element.
         row_bytes, _ = self._table.strides
         rows = np.arange(len(self._table))
-        user[: rows.size, 0] = self._table.ctypes.data + row_bytes * rows
+        user_data[: rows.size, 0] = self._table.ctypes.data + row_bytes * rows
         mujoco.set_mjcb_control(callback)
         try:
             yield
         finally:
             mujoco.set_mjcb_control(None)
-            user[:] = 0.0
+            user_data[:] = 0.0
 
     def reset_accelerations(self, first: int) -> None:
         """Set the previous accelerations of all batch elements before a call of MuJoCo.
@@ -255,6 +266,7 @@ class _CallbackContexts:
             first: number of the first step of the call. Before step 0 the acceleration is set to
                 zero, because MuJoCo's initial one lacks the applied forces.
         """
+        # 0 in this column means that the acceleration is in the registers, not in MuJoCo's data.
         self._table[:, HAS_ACCELERATION] = 0
         for batch_index, registers in enumerate(self._registers):
             registers[self._acceleration_registers] = (
@@ -286,8 +298,10 @@ def find_data_offsets() -> dict[str, int] | None:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     field_at_address = {getattr(data, name).ctypes.data: name for name in DATA_FIELDS}
+    # Without the address of the data, or with two arrays at one address, no search is possible.
     if not hasattr(data, "_address") or len(field_at_address) < len(DATA_FIELDS):
         return None
+    # The memory of MuJoCo's data, as integers of eight bytes.
     data_words = (ctypes.c_int64 * MAX_DATA_WORDS).from_address(data._address)
     offsets: dict[str, int] = {}
     for word in range(MAX_DATA_WORDS):

@@ -95,13 +95,15 @@ def replace_diverging_points(quotients: DifferenceQuotients) -> DifferenceQuotie
     diverge, nothing is replaced.
 
     Args:
-        quotients: the quotients at all points, in the order of time.
+        quotients: the derivatives of a step at all points, in the order of time; those of the state
+            after it by the state before it are the matrices `states`.
     """
     largest = np.abs(quotients.states).max(axis=(1, 2), initial=0.0)
     # The comparison is false for NaN, so these points are suspects, too.
     suspects = np.flatnonzero(~(largest <= SUSPECT_RATIO * np.median(largest)))
     diverges = np.zeros(largest.size, dtype=bool)
     for point in suspects.tolist():
+        # The growth in one step is the spectral radius of the matrix.
         matrix = quotients.states[point]
         diverges[point] = (
             not np.isfinite(matrix).all()
@@ -110,10 +112,11 @@ def replace_diverging_points(quotients: DifferenceQuotients) -> DifferenceQuotie
     others = np.flatnonzero(~diverges)
     if not diverges.any() or not others.size:
         return quotients
-    nearest = np.arange(largest.size)
+    # Each point takes all derivatives from a source: itself, or the nearest point that is valid.
+    sources = np.arange(largest.size)
     for point in np.flatnonzero(diverges).tolist():
-        nearest[point] = others[np.argmin(np.abs(others - point))]
-    return DifferenceQuotients(*(values[nearest] for values in quotients))
+        sources[point] = others[np.argmin(np.abs(others - point))]
+    return DifferenceQuotients(*(values[sources] for values in quotients))
 
 
 class Perturbation(NamedTuple):
@@ -150,23 +153,27 @@ class TangentModel:
     ) -> None:
         """Prepare the interpolation between points, and compute the difference quotients if needed.
 
+        A linearisation point is a step of the motion at which derivatives are computed. They are
+        used for this step and those that follow, until the next point.
+
         Args:
             at: linearisation points of the motion.
-            sizes: (E,) typical forces in N or N m, which set the finite differences of forces.
+            sizes: (E,) typical forces in N or N m, which set the finite differences of forces; E is
+                the number of velocities, of joints and of floating bodies.
             quotients: difference quotients of another motion nearby, to be used for this one;
                 computed if None, or if they belong to other points.
         """
         self._at, self._motion = at, at.motion
         self._sizes = sizes
         self._steps = len(at.motion.controls)
-        # Time (S,) from its linearisation point to each of the S steps, as a share of the regular
-        # distance between points; and the indices (S,) of the points between which changes at
-        # points are interpolated to each step.
-        numbers = np.arange(self._steps)
-        self._share: Array = (numbers - at.point_steps[at.point_of_step]) / at.point_spacing
-        self._earlier, self._later = _find_neighbours(at.point_steps, at.point_spacing)[
-            :, at.point_of_step
-        ]
+        # Distance (S,) of each of the S steps from its linearisation point, as a share of the
+        # regular distance between points.
+        step_numbers = np.arange(self._steps)
+        self._share: Array = (step_numbers - at.point_steps[at.point_of_step]) / at.point_spacing
+        # Indices (S,) of the two points between which values at points are interpolated to a step.
+        earlier_points, later_points = _find_neighbours(at.point_steps, at.point_spacing)
+        self._earlier = earlier_points[at.point_of_step]
+        self._later = later_points[at.point_of_step]
         # If commands change at other times, the linearisation points differ.
         points_and_states = at.point_steps.size, self.state_size
         if quotients is None or quotients.states.shape[:2] != points_and_states:
@@ -201,10 +208,11 @@ class TangentModel:
         They are positions, velocities, activations, hidden states of effects, and displacements and
         velocities of floating bodies.
         """
-        motion, joints = self._motion, self._motion.x.shape[1]
-        floating = self._sizes.size - joints
-        hidden = len(self._at.hidden_state_effects)
-        size: int = 2 * (joints + floating) + hidden + motion.act.shape[1]
+        velocities = self._sizes.size  # of joints and of floating bodies
+        activations = self._motion.act.shape[1]
+        hidden_states = len(self._at.hidden_state_effects)
+        # Each velocity has a position of the joint, or a displacement of the floating body.
+        size: int = 2 * velocities + activations + hidden_states
         return size
 
     def _compute_difference_quotients(self) -> DifferenceQuotients:
@@ -219,7 +227,7 @@ class TangentModel:
         """
         # 1. Displacements as quantity, index and size. The quantities are q position, v velocity,
         # a activation, w hidden state of an effect, p and r displacement and velocity of floating
-        # bodies, f force, u control.
+        # bodies, f force, u control. The order is that of the components of a state.
         joint_count = self._motion.x.shape[1]
         floating_count = self._sizes.size - joint_count
         na, nu = self._motion.act.shape[1], self._motion.controls.shape[1]
@@ -236,8 +244,9 @@ class TangentModel:
             ],
             "control": [("u", j, CONTROL_DIFFERENCE) for j in range(nu)],
         }
-        # 2. Differences.
+        # 2. Differences of the results: accelerations, or states after a step.
         if self._at.steps_joints_by_runge_kutta:
+            # In the middle of the steps for which a derivative is used.
             evaluate = partial(self._at.compute_accelerations, self._at.acting, at_centres=True)
             unchanged_results, unchanged_readings = evaluate()
         else:
@@ -288,15 +297,17 @@ class TangentModel:
             mujoco_batch: batch whose model has the required elements.
 
         Returns:
-            Equivalent forces (N, E) and direct changes of readings (N, O), divided by `change`.
+            Equivalent forces (N, E) on the E velocities of joints and floating bodies, and direct
+            changes (N, O) of the O readings at unchanged states, both divided by `change`.
         """
         if self._at.has_contacts and not self._at.steps_joints_by_runge_kutta:
             return self._perturb_numbers_at_contacts(acting, change, mujoco_batch)
+        # With these forces the unchanged model has its mean accelerations over a step.
         step_mean_forces = self._mean_acceleration_forces
         with self._at.with_batch(mujoco_batch):
             accelerations, readings = self._at.compute_accelerations(acting, step_mean_forces)
-            # External forces change readings of drives immediately, so the other readings are
-            # computed without these forces.
+            # Sensors of drive forces do not depend on these applied forces, but others do, such as
+            # an accelerometer. Then all are read without these forces, like the base readings.
             if self._at.reads_others:
                 _, readings = self._at.compute_accelerations(acting)
         difference = (accelerations - self._accelerations_with_mean_forces) / change
@@ -307,12 +318,12 @@ class TangentModel:
     def _perturb_numbers_at_contacts(
         self, acting: ActiveEffects, change: float, mujoco_batch: MujocoBatch
     ) -> tuple[Array, Array]:
-        """Return the result of `perturb_model_numbers` for a robot whose geoms touch.
+        """Compute the perturbation by other model parameters for a robot whose geoms touch.
 
         Without contacts, a change da of the acceleration by other model parameters is equivalent to
-        the force M da. But a contact reacts to this force, so that the motion would not change by
-        da. The force that changes the velocity after a step by dv is inv(B) dv, with the
-        derivatives B of this velocity by forces, which include the reaction.
+        the force M da with the inertia matrix M. But a contact reacts to this force, so that the
+        motion would not change by da. The force that changes the velocity after a step by dv is
+        inv(B) dv, with the derivatives B of this velocity by forces, which include the reaction.
 
         Args:
             acting: active effects including the one that changes the parameters.
@@ -320,15 +331,17 @@ class TangentModel:
             mujoco_batch: batch whose model has the required elements.
 
         Returns:
-            Equivalent forces (N, E) and direct changes of readings (N, O), divided by `change`.
+            Equivalent forces (N, E) on E joints at N points, and direct changes (N, O) of O
+            readings, both divided by `change`.
         """
         with self._at.with_batch(mujoco_batch):
             ends, readings = self._at.step_displaced({}, acting)
         # A state begins with the positions and the velocities of the E joints.
-        velocities = slice(self._sizes.size, 2 * self._sizes.size)
-        base_ends, _ = self._base_step
+        joint_count = self._sizes.size
+        velocities = slice(joint_count, 2 * joint_count)
+        base_ends, _ = self._base_step  # states after a step without the change
         difference = (ends - base_ends)[:, velocities] / change
-        derivatives = self.quotients.forces[:, velocities]
+        derivatives = self.quotients.forces[:, velocities]  # B, (N, E, E)
         force: Array = np.linalg.solve(derivatives, difference[..., None])[..., 0].astype(
             np.float64
         )
@@ -370,6 +383,7 @@ class TangentModel:
             effect: effect with a force.
             c: coefficients (K, 1, 1).
         """
+        # Forces (S, D) on D joints along the motion of S steps.
         forces = self._at.compute_effect_force(effect, c)
         changes = [
             Perturbation(owner, joint=joint, series=series)
@@ -421,7 +435,8 @@ class TangentModel:
         state_size = quotients.forces.shape[1]
         steps = self._steps
         inputs, readings = self.sum_inputs_and_readings(changes, count)
-        # States, forces and controls are stacked, so that a step is one matrix product.
+        # States, forces and controls of each step are stacked, so that a step is one matrix product
+        # with [A, B, C]. Its result is the state part of the next step.
         stacked = np.zeros((steps + 1, state_size + inputs.shape[1], count))
         stacked[:-1, state_size:] = inputs
         if initial is not None:
@@ -436,6 +451,7 @@ class TangentModel:
                 stacked_steps[step_index],
                 out=stacked_steps[step_index + 1][:state_size],
             )  # (2)
+        # Readings change directly (so far), and by the changed states.
         if readings.shape[1]:
             readings += np.matmul(
                 quotients.read_states[self._at.point_of_step], stacked[:-1, :state_size]
@@ -461,12 +477,11 @@ class TangentModel:
             Changes (S, E + nu, n) of E forces and nu controls in S steps; and changes (S, O, n) of
             O readings at unchanged states.
         """
-        quotients = self.quotients
-        force_count = quotients.forces.shape[2]
-        steps = self._steps
-        control_count = quotients.controls.shape[2]
+        quotients, steps = self.quotients, self._steps
+        force_count, control_count = quotients.forces.shape[2], quotients.controls.shape[2]
         reading_count = self._at.output_count
-        # The series of one owner are contiguous in memory while they are added up.
+        # The series of one owner are contiguous in memory while they are added up. Forces come
+        # first, then controls: their means over the steps, and their values at the beginnings.
         inputs = np.zeros((force_count + control_count, count, steps))
         instant_inputs = (
             np.zeros((control_count, count, steps)) if reading_count else inputs[force_count:]
@@ -511,6 +526,7 @@ class TangentModel:
     def motion_readings(self) -> Array:
         """Readings (S, O) of O outputs at the beginnings of S steps, as computed by the model."""
         motion, points = self._motion, self._at.point_of_step
+        # The model is evaluated at all steps instead of the linearisation points.
         with self._at.at_steps(np.arange(self._steps)):
             _, step_readings = self._at.compute_accelerations(self._at.acting)
         # The model was evaluated with the mean of a command over the step, while a sensor shows its
@@ -529,10 +545,11 @@ class TangentModel:
         doi:10.1098/rsta.1911.0009).
 
         Args:
-            finer: batch with half the time step.
+            finer: batch of the same model with half the time step.
 
         Returns:
-            (N, Z) exact minus computed state after a step from each point.
+            (N, Z) exact minus computed state, of Z components, after a step from each of the N
+            linearisation points.
         """
         with self._at.with_batch(finer):
             finer_state, _ = self._at.step_displaced({}, self._at.acting, steps=2)
@@ -543,11 +560,12 @@ class TangentModel:
     def defects(self) -> Array:
         """Differences (S, Z) between the motion and the model's own step, the defect of each step.
 
-        The model starts each step from the state of the motion. The defect is zero for a
-        simulated motion, and not zero for a measured one. Only positions and velocities of joints
-        and floating bodies have defects.
+        The model starts each of the S steps from the state of the motion, with Z components. The
+        defect is zero for a simulated motion, and not zero for a measured one. Only positions and
+        velocities of joints and floating bodies have defects.
         """
         motion, joints = self._motion, self._motion.x.shape[1]
+        # A state begins with the positions and velocities of the joints.
         predicted_states, _ = self._every_step
         defects = np.zeros_like(predicted_states)
         defects[:, :joints] = motion.x[1:] - predicted_states[:, :joints]
@@ -565,19 +583,22 @@ class TangentModel:
         """Compute how the defects (S, Z) differ from those of a model with other parameters.
 
         The defect is the difference between the motion and the model's own step, so it changes by
-        the difference of both steps. One step in the middle of those that a linearisation point
-        stands for represents them all, unless commands differ too.
+        the difference of both steps. A linearisation point stands for its own step and those that
+        follow until the next point. One step in their middle represents them all, unless commands
+        differ too.
 
         Args:
             similar: model of the same motion.
 
         Returns:
-            The defects of this model minus those of the other one.
+            The defects of this model minus those of the other one, for Z state components in each
+            of S steps.
         """
         if not np.array_equal(self._motion.controls, similar._motion.controls):
             return self.defects - similar.defects
         ends = np.append(self._at.point_steps[1:], self._steps)
         middle = (self._at.point_steps + ends) // 2
+        # Evaluate steps from the middle instead of the point itself.
         with self._at.at_steps(middle):
             states, _ = self._at.step_displaced({}, self._at.acting)
         similar_states, _ = similar._every_step
@@ -631,9 +652,10 @@ def compute_runge_kutta_step(
 ) -> tuple[Array, Array, Array]:
     """Compute the derivatives of a Runge-Kutta step from those of the acceleration.
 
-    The derivative of the state's rate by the state is K = [[0, I], [da/dq, da/dv]], and by a force
-    L = [[0], [da/df]]. Held constant in a step of length h, they give the derivatives A = I + P K
-    by the state and B = P L by forces, with P = h I + h^2 K / 2 + h^3 K^2 / 6 + h^4 K^3 / 24 (3).
+    With positions q, velocities v, accelerations a and forces f, the derivative of the state's rate
+    by the state (q, v) is K = [[0, I], [da/dq, da/dv]], and by a force L = [[0], [da/df]]. Held
+    constant in a step of length h, they give the derivatives A = I + P K by the state and B = P L
+    by forces, with P = h I + h^2 K / 2 + h^3 K^2 / 6 + h^4 K^3 / 24 (3).
 
     Args:
         by_state: (N, D, 2 D) derivatives of accelerations of D joints by positions and velocities,
@@ -649,19 +671,21 @@ def compute_runge_kutta_step(
     rates = np.zeros((points, size, size))  # K
     rates[:, :joints, joints:] = np.eye(joints)
     rates[:, joints:] = by_state
-    scaled = step * rates
+    scaled = step * rates  # h K
     unit = np.eye(size)
+    # P, by Horner's rule.
     propagator = step * (unit + scaled @ (unit / 2 + scaled @ (unit / 6 + scaled / 24)))
     of_velocity = propagator[:, :, joints:]  # L is zero for the positions
     return unit + propagator @ rates, of_velocity @ by_force, of_velocity @ by_control
 
 
 def _find_neighbours(point_steps: IndexArray, spacing: int) -> IndexArray:
-    """Find the pairs of linearisation points for interpolation.
+    """Find the pairs of linearisation points between which values are interpolated.
 
-    Two points that are not `spacing` steps apart belong to different commands, between which
-    nothing is interpolated. A point forms a pair with the next point of its command, or else with
-    the previous one. If neither exists, it forms a pair with itself.
+    Points follow one another at a regular distance, until a command changes. Two points that are
+    not `spacing` steps apart therefore belong to different commands, between which nothing is
+    interpolated. A point forms a pair with the next point of its command, or else with the previous
+    one. If neither exists, it forms a pair with itself.
 
     Args:
         point_steps: (N,) steps of the linearisation points.
