@@ -58,7 +58,7 @@ def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
         is_with_base = first == 0 and second in base_children
         if contact.dist < -OVERLAP_DEPTH and not is_with_base:
             overlapping_pairs.add((first, second))
-    # Exclusions and notes.
+    # Exclusions and notes. Body 0 is the base.
     names = [model.body(i).name for i in range(model.nbody)]
     for first, second in [*((0, i) for i in base_children), *sorted(overlapping_pairs)]:
         spec.add_exclude(bodyname1=names[first], bodyname2=names[second])
@@ -109,7 +109,7 @@ def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
     (body, contype, affinity), row_indices = np.unique(
         np.stack(geom_rows), axis=1, return_inverse=True
     )
-    # Matrices of all pairs of rows.
+    # Matrices of all pairs of rows: which pairs can collide.
     masks = contype[:, None] & affinity
     can_collide = (masks | masks.T) != 0
     weld_ids = weld[body]
@@ -124,6 +124,7 @@ def find_colliding_geoms(model: Any) -> NDArray[np.bool_]:
     # MuJoCo stores an excluded pair of bodies as one number, the smaller body in the upper bits.
     first, second = np.minimum(body[:, None], body), np.maximum(body[:, None], body)
     can_collide &= ~np.isin((first << 16) + second, model.exclude_signature)
+    # From rows back to geoms; those in listed pairs always collide.
     result: NDArray[np.bool_] = can_collide.any(axis=1)[row_indices.reshape(-1)]
     result[[*model.pair_geom1, *model.pair_geom2]] = True
     return result

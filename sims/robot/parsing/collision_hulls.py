@@ -225,7 +225,7 @@ def add_hull(spec: Any, name: str, hull: Hull) -> None:
     When MuJoCo compiles a mesh, it moves the vertices into the principal frame of the faces (that
     of their inertia), which would round them. So the only faces are those of a small box around the
     origin of the mesh and along its axes. The principal frame of the box is the frame of the mesh,
-    and no vertex moves.
+    and no vertex moves. Contacts use the vertices of the hull, and not the faces.
 
     Args:
         spec: editable MuJoCo model (`mujoco.MjSpec`); it is changed in place.
@@ -320,7 +320,8 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         hulls: original hulls by name of the mesh; other meshes keep their own.
     """
     names = [model.mesh(i).name for i in range(model.nmesh)]
-    # All hulls are read before the first is written, since they move within MuJoCo's arrays.
+    # All hulls are read before the first is written, since they move within MuJoCo's arrays. Meshes
+    # without an original hull keep that of the compiler.
     target_hulls = [
         hulls.get(name) or read_hull(model, i, keeps_all_vertices=True)
         for i, name in enumerate(names)
@@ -338,22 +339,22 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
         model.mesh_extrema[i] = hull.extrema
         model.mesh_graph[graph_end : graph_end + hull.graph.size] = hull.graph
         graph_end += hull.graph.size
-        # Polygons.
-        address_range = slice(polygon_end, polygon_end + hull.polygons.sizes.size)
+        # Polygons. The indices and counts are views, in which `_write_lists` writes.
+        polygon_rows = slice(polygon_end, polygon_end + hull.polygons.sizes.size)
         model.mesh_polynum[i] = hull.polygons.sizes.size
-        model.mesh_polynormal[address_range] = hull.normals
-        first_indices = model.mesh_polyvertadr[address_range]
-        counts = model.mesh_polyvertnum[address_range]
+        model.mesh_polynormal[polygon_rows] = hull.normals
+        first_indices = model.mesh_polyvertadr[polygon_rows]
+        counts = model.mesh_polyvertnum[polygon_rows]
         corner_end = _write_lists(
             model.mesh_polyvert, first_indices, counts, hull.polygons, corner_end
         )
-        polygon_end = address_range.stop
+        polygon_end = polygon_rows.stop
         # Polygons around each vertex; vertices that are not on the hull have none.
         first_vertex = int(model.mesh_vertadr[i])
         model.mesh_polymapnum[first_vertex : first_vertex + int(model.mesh_vertnum[i])] = 0
-        address_range = slice(first_vertex, first_vertex + hull.around.sizes.size)
-        first_indices = model.mesh_polymapadr[address_range]
-        counts = model.mesh_polymapnum[address_range]
+        vertex_rows = slice(first_vertex, first_vertex + hull.around.sizes.size)
+        first_indices = model.mesh_polymapadr[vertex_rows]
+        counts = model.mesh_polymapnum[vertex_rows]
         polygon_list_end = _write_lists(
             model.mesh_polymap, first_indices, counts, hull.around, polygon_list_end
         )

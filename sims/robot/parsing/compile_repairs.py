@@ -64,13 +64,14 @@ class CompileRepairs:
         """
         assets = (*spec.meshes, *spec.hfields, *spec.skins, *spec.textures)
         for _ in range(2 * (len(spec.bodies) + len(assets)) + 2):
-            # Only errors of the compiler are repaired; an `InputError` is already for the user.
+            # Only errors of the compiler are repaired; an `InputError` of a repair is already for
+            # the user.
             try:
                 uncompiled = spec.copy()
                 return uncompiled, spec.compile()
             except InputError:
                 raise
-            except Exception as error:
+            except Exception as error:  # MuJoCo raises several kinds of errors.
                 message = format_mujoco_error(error)
                 if not self._repair_named_element(spec, message):
                     break
@@ -95,6 +96,7 @@ class CompileRepairs:
         """
         name_match = re.search(r"Element name '(.*?)', id", message)
         name = name_match[1] if name_match else ""
+        # MuJoCo's message names its setting that would repair the moments.
         if "balanceinertia" in message:
             return self._repair_triangle_inequality(spec)
         if "mass and inertia of moving bodies" in message:
@@ -119,17 +121,20 @@ class CompileRepairs:
         The moments A <= B <= C of a body satisfy the triangle inequality A + B >= C. Each changed
         body is noted in `balanced`, with the values before and after.
 
+        Args:
+            spec: the model as an `MjSpec`, changed in place.
+
         Returns:
             Whether any body was changed.
         """
-        before = len(self.balanced)
+        notes_before = len(self.balanced)
         for body in spec.bodies:
             moments, axes = _get_principal_moments(body)
             if compute_triangle_violation(moments) > 0:
-                after = find_nearest_valid_moments(moments)
-                _set_principal_moments(body, after, axes)
-                self.balanced.append(f"{body.name} {format_moments(moments, after)}")
-        return len(self.balanced) > before
+                valid_moments = find_nearest_valid_moments(moments)
+                _set_principal_moments(body, valid_moments, axes)
+                self.balanced.append(f"{body.name} {format_moments(moments, valid_moments)}")
+        return len(self.balanced) > notes_before
 
     def _set_default_mass(self, spec: Any, name: str) -> bool:
         """Give a moving body the default mass and moments of inertia, where it has less.
@@ -145,23 +150,22 @@ class CompileRepairs:
         Returns:
             Whether the body was changed.
         """
-        # Names are unique, so the list has at most one body.
-        for body in [body for body in spec.bodies if body.name == name]:
-            mass, (moments, axes) = float(np.nan_to_num(body.mass)), _get_principal_moments(body)
-            is_too_light = mass < DEFAULT_BODY_MASS
-            has_small_moments = min(moments) < MIN_MOMENT * (1 - ROUNDING_SHARE)
-            body.mass = max(mass, DEFAULT_BODY_MASS)
-            _set_principal_moments(body, np.maximum(moments, MIN_MOMENT), axes)
-            body.explicitinertial = True
-            if is_too_light:
-                has_children = any(
-                    b.parent is not None and b.parent.name == name for b in spec.bodies
-                )
-                self.massless.setdefault(has_children, []).append(name)
-            elif has_small_moments:
-                self.slight.append(name)
-            return is_too_light or has_small_moments
-        return False
+        body = next((body for body in spec.bodies if body.name == name), None)
+        if body is None:
+            return False
+        # NaN is a mass that the file does not state.
+        mass, (moments, axes) = float(np.nan_to_num(body.mass)), _get_principal_moments(body)
+        is_too_light = mass < DEFAULT_BODY_MASS
+        has_small_moments = min(moments) < MIN_MOMENT * (1 - ROUNDING_SHARE)
+        body.mass = max(mass, DEFAULT_BODY_MASS)
+        _set_principal_moments(body, np.maximum(moments, MIN_MOMENT), axes)
+        body.explicitinertial = True
+        if is_too_light:
+            has_children = any(b.parent is not None and b.parent.name == name for b in spec.bodies)
+            self.massless.setdefault(has_children, []).append(name)
+        elif has_small_moments:
+            self.slight.append(name)
+        return is_too_light or has_small_moments
 
     @property
     def notes(self) -> list[str]:

@@ -35,16 +35,18 @@ def rename_invalid_names(root: Element) -> list[str]:
         Notes, at most one.
     """
     names = {element.get("name") or "" for element in root.iter()}
-    changed: dict[str, str] = {}
+    changed: dict[str, str] = {}  # new name by name in the file
     for name in sorted(names):
         valid_name = name.strip()
         for character in RESERVED_CHARACTERS:
             valid_name = valid_name.replace(character, "_")
+        # An empty name, that of elements without one, stays.
         if valid_name == name:
             continue
         while valid_name in names or valid_name in changed.values() or not valid_name:
             valid_name += "_"
         changed[name] = valid_name
+    # References to an element are attributes whose value is its name.
     for element in root.iter():
         for key, value in element.items():
             if value in changed and key not in FREE_TEXT_ATTRIBUTES:

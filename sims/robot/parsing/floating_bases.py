@@ -47,6 +47,7 @@ def separate_floating_joints(
     bases = [base for base in bases if base in floating or f"{base}.{ANGLES[0]}" not in names]
     if not bases:
         return (), []
+    # The compiled model has the poses of the bodies in one form, whatever form the file uses.
     model = spec.copy().compile()
     for base in bases:
         if base not in floating:
@@ -80,7 +81,9 @@ def separate_floating_joints(
             slide = _add_joint(
                 body, f"{base}.{name}", mujoco.mjtJoint.mjJNT_SLIDE, axes_in_body[:, k]
             )
+            # The position at which the body is in the file, so that the slide shows its place.
             slide.ref = float(compiled_body.pos[k])
+        # Yaw about z, pitch about y, roll about x.
         for k, name in zip((2, 1, 0), ANGLES, strict=True):
             hinge = _add_joint(
                 body, f"{base}.{name}", mujoco.mjtJoint.mjJNT_HINGE, axes_in_body[:, k]

@@ -73,6 +73,9 @@ class MeshLookup:
         * ``package://PACKAGE/PATH`` and ``model://PACKAGE/PATH`` are sought in the model file's
           folder and in those above it, as ROS does.
         * Other schemes are unknown, so there are no paths.
+
+        Args:
+            name: file name or URI as in the URDF.
         """
         model_folder = self.files.path.parent
         scheme, separator, uri_path = name.partition("://")
@@ -92,10 +95,11 @@ class MeshLookup:
         candidates = []
         resolved_folder = model_folder.resolve()
         for folder in [resolved_folder, *resolved_folder.parents][: MAX_PARENT_FOLDERS + 1]:
+            path_in_package = folder.joinpath(*relative_parts)
             # The folder is the package, contains it, or is the package under another name.
-            package_path = folder.joinpath(*relative_parts)
-            candidates += [package_path] if folder.name == package else []
-            candidates += [folder / uri_path, package_path]
+            if folder.name == package:
+                candidates.append(path_in_package)
+            candidates += [folder / uri_path, path_in_package]
         return candidates
 
     def leave_out(self, name: str, reason: str) -> None:
@@ -151,7 +155,7 @@ class OmittedShapes:
         """
         body = geom.parent
         if determines_mass(spec, geom, body):
-            if np.isfinite(geom.mass):
+            if np.isfinite(geom.mass):  # NaN is a mass that the file does not state.
                 _replace_by_sphere(geom)
                 self.replaced.setdefault(reason, []).append(f"{body.name} {geom.mass:g} kg")
                 return
@@ -160,7 +164,9 @@ class OmittedShapes:
                 f"{truncate_text(body.name)} would follow from it; "
                 "repair the mesh, or state the body's <inertial>"
             )
-        group = self.colliding if geom.contype or geom.conaffinity else self.visual
+        # A geom without contact types touches nothing.
+        can_touch = geom.contype or geom.conaffinity
+        group = self.colliding if can_touch else self.visual
         group.setdefault(reason, []).append(label)
         spec.delete(geom)
 
@@ -246,16 +252,18 @@ def find_assets_of_file(spec: Any, path: str) -> list[Any]:
         path: path of the file as in MuJoCo's messages, with the folder of the assets.
     """
     assets = [*spec.meshes, *spec.hfields, *spec.skins, *spec.textures]
+    # A texture that is a cube map has several files.
     files = [[asset.file, *getattr(asset, "cubefiles", ())] for asset in assets]
 
-    def select(is_needed: Callable[[str], bool]) -> list[Any]:
+    def select_assets(is_wanted_file: Callable[[str], bool]) -> list[Any]:
+        """Return the assets of which any file name fulfils a condition."""
         return [
             asset
             for asset, names in zip(assets, files, strict=True)
-            if any(is_needed(name) for name in names if name)
+            if any(is_wanted_file(name) for name in names if name)
         ]
 
-    return select(lambda name: f"/{path}".endswith(f"/{name}")) or select(
+    return select_assets(lambda name: f"/{path}".endswith(f"/{name}")) or select_assets(
         lambda name: Path(name).name == Path(path).name
     )
 
@@ -287,6 +295,7 @@ def remove_asset(spec: Any, asset: Any, reason: str, omitted: OmittedShapes) -> 
         omitted.visual.setdefault(reason, []).append(label)
         return
     if isinstance(asset, mujoco.MjsSkin):
+        # No geom uses a skin, which is only drawn.
         omitted.visual.setdefault(reason, []).append(label)
     else:
         attribute = "meshname" if isinstance(asset, mujoco.MjsMesh) else "hfieldname"

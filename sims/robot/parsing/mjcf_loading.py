@@ -51,15 +51,18 @@ def read_referenced_files(files: ModelFileReader, root: Element) -> None:
         InputError: a count, a size or a file is too large, or an attached model is missing.
     """
     _check_sizes(files, root, 1.0)
+    # Folders of meshes and textures, and whether folders in the names of files are ignored.
     settings = {key: value for e in find_children(root, "compiler") for key, value in e.items()}
     asset_folder = settings.get("assetdir", "")
     mesh_folder = settings.get("meshdir", asset_folder)
     texture_folder = settings.get("texturedir", asset_folder)
     strip = settings.get("strippath") == "true"
+    # Flexible bodies.
     for element in root.iter("flexcomp"):
         file = element.get("file")
         if file and _read_asset(files, mesh_folder, file, strip):
             element.set("file", str((files.path.parent / mesh_folder / file).resolve()))
+    # Meshes, textures and other assets, and attached models.
     for asset in find_children(root, "asset"):
         for part in asset:
             if part.tag == "model":
@@ -85,17 +88,16 @@ def _check_sizes(files: ModelFileReader, element: Element, factor: float) -> Non
         InputError: a size is too large, or there would be too many copies.
     """
     for key, value in element.items():
-        size_numbers = (
-            [_parse_size(number_text) for number_text in value.split()]
-            if key in (*COUNT_ATTRIBUTES, *MAX_SIZE_ATTRIBUTES)
-            else []
-        )
+        sizes: list[float] = []
+        if key in (*COUNT_ATTRIBUTES, *MAX_SIZE_ATTRIBUTES):
+            sizes = [_parse_size(number_text) for number_text in value.split()]
         max_value = MAX_SIZE_ATTRIBUTES.get(key, MAX_COUNT)
+        # A count of several numbers is that of a grid.
         if key in COUNT_ATTRIBUTES:
-            factor *= math.prod(max(number, 1.0) for number in size_numbers)
-        if max([factor, *size_numbers]) > max_value or (
-            key.startswith("nuser_") and _parse_size(value) > MAX_COUNT
-        ):
+            factor *= math.prod(max(number, 1.0) for number in sizes)
+        # Attributes such as `nuser_body` request user data for each element of a kind.
+        has_much_user_data = key.startswith("nuser_") and _parse_size(value) > MAX_COUNT
+        if max([factor, *sizes]) > max_value or has_much_user_data:
             raise files.make_error(
                 element, f'{key}="{truncate_text(value)}" is too much: at most {max_value:g} in all'
             )

@@ -94,9 +94,13 @@ def restore_floating_joints(robot: RobotModel) -> RobotModel:
 
     The slides and hinges had replaced them, since the pose of the body is recorded. The file is
     read again; settings that are not in the file are kept.
+
+    Args:
+        robot: robot whose `recorded_bases` names the replaced joints; without any, it is returned.
     """
     if not robot.recorded_bases:
         return robot
+    # Without this entry of the engine table, no joint is replaced.
     engine = {k: entry for k, entry in robot.engine_table.items() if k != "recorded_bases"}
     restored = read_robot(robot.path, actuators=robot.actuator_tables, engine=engine)
     return restored.with_friction_form(robot.friction_form).with_contacts(robot.contacts)
@@ -147,10 +151,11 @@ def _make_robot(
     rate_controlled = added_actuators.add_actuators(spec, actuators, tables_source)
     notes += apply_engine_settings(spec, engine, tables_source)
     notes += element_names.name_unnamed_elements(spec)
-    bases, base_notes = floating_bases.separate_floating_joints(
-        spec, () if engine.get("fix_base") else engine.get("recorded_bases", ()), source
-    )
+    # A base that is fixed has no joint to replace.
+    recorded_bases = () if engine.get("fix_base") else engine.get("recorded_bases", ())
+    bases, base_notes = floating_bases.separate_floating_joints(spec, recorded_bases, source)
     notes += base_notes
+    # Names of the bodies before MuJoCo fuses some of them, with their parents.
     parents = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
     # 3. Compilation.
     spec, model = repairs.compile(spec)
@@ -165,6 +170,7 @@ def _make_robot(
     warning_notes = [f"MuJoCo warns: {warning}" for warning in dict.fromkeys(warnings)]
     if model.nu == 0:
         warning_notes.insert(0, NO_ACTUATORS_NOTE)
+    # The digest identifies the robot, so it includes what the recording adds to the file.
     settings = json.dumps([actuators, engine], sort_keys=True, default=str)
     files.add_to_digest(settings.encode())
     robot = RobotModel(
@@ -199,6 +205,10 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
     It must have a joint, its time step must be in the allowed range, and masses, inertias, places
     and forces of its joints must be finite and not huge. The message names the first wrong value.
 
+    Args:
+        files: reader of the model file, whose path messages state.
+        model: compiled model.
+
     Raises:
         InputError: nothing moves, the time step is out of range, or a number is huge or not finite.
     """
@@ -215,7 +225,8 @@ def _check_model(files: ModelFileReader, model: Any) -> None:
         if len(fault_indices):
             first_fault = tuple(fault_indices[0])
             row, *_ = first_fault
-            # MuJoCo's fields begin with "body", "jnt" or "dof", which says what a row belongs to.
+            # MuJoCo's fields begin with "body", "jnt" or "dof", which says what a row belongs to:
+            # ``dof_damping`` has a row for each velocity of a joint.
             kind, quantity = field.split("_", 1)
             joint = model.dof_jntid[row] if kind == "dof" else row
             name = (model.body(row) if kind == "body" else model.joint(joint)).name

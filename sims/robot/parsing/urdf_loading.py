@@ -62,6 +62,7 @@ def repair_inertials(
     Raises:
         InputError: a mass is negative, or an entry is not a number.
     """
+    # Links for notes: with a mass but no moments; with changed moments; and without an inertial.
     point_masses, raised_links, inferred_links = [], [], []
     for name, link in links.items():
         inertials = find_children(link, "inertial")
@@ -170,9 +171,9 @@ def remove_unusable_shapes(
     for key in MESH_FOLDER_SETTINGS:
         compiler.attrib.pop(key, None)
     for name, link in links.items():
-        has_mass = (
-            bool(find_children(link, "inertial")) and not is_mass_inferred
-        ) or name in fixed_links
+        has_stated_mass = bool(find_children(link, "inertial")) and not is_mass_inferred
+        # The mass of a link that never moves does not matter.
+        has_mass = has_stated_mass or name in fixed_links
         for shape in find_children(link, "visual"):
             link.remove(shape)
         for shape in find_children(link, "collision"):
@@ -200,6 +201,7 @@ def _resolve_collision_shape(
     Raises:
         InputError: the mesh cannot be read, and the mass of the link depends on it.
     """
+    # A shape has at most one mesh.
     for mesh in find_children(shape, "geometry", "mesh"):
         file = mesh.get("filename") or ""
         path, reason = meshes.find(file)
@@ -438,11 +440,12 @@ def _find_parent_links(
                 f"link {truncate_text(child)} has two parent joints; a closed loop needs an MJCF",
             )
         parents[child] = (parent, joint)
-    # No cycles: the way to the root has fewer steps than there are links.
+    # No cycles: the way to the root, which has no parent, has fewer steps than there are links.
     for name in links:
         ancestor, steps = name, 0
         while ancestor in parents:
-            (ancestor, _), steps = parents[ancestor], steps + 1
+            ancestor, _ = parents[ancestor]  # parent link, and the joint to it
+            steps += 1
             if steps > len(links):
                 raise files.make_error(links[name], f"link {truncate_text(name)} is its own parent")
     return parents
@@ -473,7 +476,8 @@ def _get_compiler_element(root: Element) -> Element:
 def _check_mujoco_settings(files: ModelFileReader, root: Element) -> None:
     """Check the element ``<mujoco>`` of a URDF, in which MuJoCo would ignore wrong settings.
 
-    Each setting is parsed alone as an MJCF, in which MuJoCo reports unknown names.
+    Each setting, a child element such as ``<compiler>``, is parsed alone as an MJCF, in which
+    MuJoCo reports unknown names.
 
     Args:
         files: reader of the files of the model.
@@ -563,6 +567,7 @@ def _remove_meaningless_limits(joints: Sequence[Element]) -> list[str]:
                 del limit.attrib["effort"]
             elif effort > 0:
                 effort_limits.append(f"{name} {effort:g}")
+            # Missing limits count as zero, so a range without numbers is empty.
             lower, upper = (parse_number(limit.get(key)) for key in ("lower", "upper"))
             is_continuous = kind == "continuous"
             if is_continuous or lower >= upper:
@@ -611,7 +616,7 @@ def _remove_unsupported_mimics(joints: Sequence[Element]) -> list[str]:
         joints: elements of the joints, changed in place.
     """
     kinds = {joint.get("name"): joint.get("type") for joint in joints}
-    kept_mimics, removed_mimics = [], []
+    kept_mimics, removed_mimics = [], []  # texts for the notes
     for joint in joints:
         for mimic in find_children(joint, "mimic"):
             name, leading_joint = joint.get("name") or "", mimic.get("joint") or ""

@@ -64,9 +64,13 @@ class ModelFileReader:
         """Make the error for a message of MuJoCo about the text that it was given.
 
         The line in that text is replaced by the line in the user's file.
+
+        Args:
+            message: message of MuJoCo in one line, such as ``...; Element 'joint', line 6``.
         """
         line = re.search(r", line (\d+)", message)
         number = int(line[1]) if line else 0
+        # One element begins in each line of the text.
         element = self.given[number - 1] if 0 < number <= len(self.given) else None
         remedy = SCHEMA_REMEDY if message.startswith("Schema violation") else ""
         return self.make_error(element, re.sub(r", line \d+", "", message) + remedy)
@@ -122,12 +126,13 @@ def parse_tree(files: ModelFileReader, path: Path) -> Element:
         )
     # Like MuJoCo's parser, accept blank lines before the declaration and zero bytes after the end.
     text = file_content.rstrip(b"\0").lstrip(b" \t\r\n")
+    # Number of lines above the text, which the parser does not see.
     skipped_lines = file_content[: file_content.find(text[:1])].count(b"\n") if text else 0
     parser = expat.ParserCreate()
     builder = _LineTrackingTreeBuilder(files, path, parser, skipped_lines)
     try:
         parser.Parse(text, True)
-    except InputError:
+    except InputError:  # A handler of the builder refuses something; the message is complete.
         raise
     except expat.ExpatError as error:
         reason = expat.ErrorString(error.code)
@@ -145,8 +150,12 @@ class _LineTrackingTreeBuilder:
     def __init__(self, files: ModelFileReader, path: Path, parser: Any, skipped_lines: int) -> None:
         """Set the handlers of the parser, which call this object for each tag.
 
-        `skipped_lines` is the number of lines of the file above the parsed text; it is added to
-        line numbers.
+        Args:
+            files: reader of the model, which records the line of each element.
+            path: path of the file, for messages.
+            parser: parser of Python's module expat.
+            skipped_lines: number of lines of the file above the parsed text; it is added to line
+                numbers.
         """
         self.files, self.path, self.parser, self.above = files, path, parser, skipped_lines
         self.open: list[Element] = []
