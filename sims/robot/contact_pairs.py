@@ -135,6 +135,8 @@ def combine_contact_parameters(model: Any, geoms: tuple[int, int]) -> ContactPar
 def find_pair(robot: RobotModel, pair: str) -> int:
     """Return the number of the element `<pair>` of two geoms in the compiled model.
 
+    The order of the two geoms does not matter.
+
     Args:
         robot: robot with this element, such as a result of `add_contact_pairs`.
         pair: names of both geoms, joined by `PAIR_SEPARATOR`.
@@ -162,7 +164,9 @@ def has_pair(robot: RobotModel, geoms: Collection[int]) -> bool:
 def read_contact_parameters(robot: RobotModel, pair: str) -> tuple[float, Array]:
     """Return the sliding friction coefficient and `solref` of a contact of two geoms.
 
-    They are those of its element `<pair>`, or the combined ones of both geoms without an element.
+    MuJoCo's `solref` is the time constant and the damping ratio of a contact, or its negative
+    stiffness and damping. The numbers are those of the element `<pair>` of the contact, or the
+    combined ones of both geoms without an element.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.

@@ -89,6 +89,7 @@ def make_coupled_robot(robot: RobotModel, coefficients: Mapping[str, float]) -> 
         tendon = spec.add_tendon(name=name + COUPLING_TENDON_SUFFIX)
         tendon.wrap_joint(name, 1.0)
         tendon.wrap_joint(preceding_joint.name, c)
+        # The actuators of the joint get the tendon as their target.
         for actuator in spec.actuators:
             if robot.actuators[actuator.id].joint == name:
                 actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON

@@ -87,10 +87,11 @@ def write_friction_form(fields: Fields, robot: RobotModel, batch_indices: Any, d
 def get_friction_constraint(robot: RobotModel, dof: int) -> tuple[float, float]:
     """Return damping b (1/s) and impedance d of MuJoCo's constraint for dry friction.
 
-    The constraint has the reference acceleration -b v at the velocity v. The values are those of
-    the robot's `friction_form`, in which effects add friction. With `solref` (timeconst, dampratio)
-    and the largest impedance d_max of `solimp`, MuJoCo sets b = 2 / (d_max timeconst). Negative
-    numbers (-stiffness, -damping) give b = damping / d_max.
+    The constraint has the reference acceleration -b v at the velocity v; the impedance, from 0 to
+    1, is how strongly it acts. The values are those of the robot's `friction_form`, in which
+    effects add friction: stiff, or as in the model file. With `solref` (timeconst, dampratio) and
+    the largest impedance d_max of `solimp`, MuJoCo sets b = 2 / (d_max timeconst). Negative numbers
+    (-stiffness, -damping) give b = damping / d_max.
 
     Args:
         robot: robot with the time step and the integrator in use.
@@ -104,11 +105,13 @@ def get_friction_constraint(robot: RobotModel, dof: int) -> tuple[float, float]:
         solref = get_friction_solref(float(model.opt.timestep), int(model.opt.integrator))
         solimp = FRICTION_SOLIMP
     timeconst, second = (float(value) for value in solref)
+    # `solimp` has the impedance at no constraint violation, the largest one, and the violation at
+    # which the impedance is the largest one.
     limits = np.clip(solimp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     (at_rest, largest), width = limits.tolist(), float(solimp[2])
     # Friction has no constraint violation. For a constant impedance, MuJoCo takes the mean.
     d = at_rest if width > mujoco.mjMINVAL else 0.5 * (at_rest + largest)
-    if timeconst <= 0:
+    if timeconst <= 0:  # The numbers are -stiffness and -damping.
         return -second / largest, d
     # By default, MuJoCo uses no smaller time constant than two time steps.
     if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE):

@@ -92,12 +92,13 @@ class FittedCause:
         if self.effect in OPTION_EFFECTS:
             (estimate,) = self.numbers.values()
             option = OPTION_EFFECTS[self.effect]
+            # Numbers in the model file (`stated`) and with the cause (`total`), if they are known.
             # The value of such an estimate is the option's number itself, not a change of it.
             before, after = (
                 format_option(option, value if value is not None else estimate.value)
                 for value in (estimate.stated, estimate.total)
             )
-            if isinstance(after, str):
+            if isinstance(after, str):  # The option has words.
                 return f"{self.name}: from {before} to {after}{origin_text}"
         numbers = [
             (f"{name} " if has_several else "") + _format_estimate(estimate)

@@ -62,9 +62,9 @@ class FloatingJoints:
     def from_robot(cls, robot: RobotModel) -> FloatingJoints:
         """Return the floating joints of a robot, with their addresses in `qpos` and `qvel`.
 
-        A free joint has a position and a quaternion in `qpos`, 7 numbers, and a velocity and an
-        angular velocity in `qvel`, 6 numbers. A ball joint has only the quaternion and the angular
-        velocity.
+        A floating joint is a free joint or a ball joint. A free joint has a position and a
+        quaternion in `qpos`, 7 numbers, and a velocity and an angular velocity in `qvel`, 6
+        numbers. A ball joint has only the quaternion and the angular velocity.
         """
         joints = tuple(joint for joint in robot.joints if not joint.has_one_coordinate)
         positions = [
@@ -164,6 +164,7 @@ class FloatingJoints:
         import mujoco
 
         displaced_poses = pose.copy()
+        # MuJoCo's function needs the whole vectors; the other joints stay at rest.
         positions, velocities = self.model.qpos0.copy(), np.zeros(self.model.nv)
         for displaced_pose, displacement in zip(displaced_poses, displacements, strict=True):
             positions[self.positions] = displaced_pose
@@ -181,11 +182,13 @@ class FloatingJoints:
         import mujoco
 
         displacements = np.empty((len(pose), self.velocities.size))
-        before, after = self.model.qpos0.copy(), self.model.qpos0.copy()
+        # MuJoCo's function needs the whole vectors, and returns velocities that lead from the first
+        # to the second pose in one second.
+        start, end = self.model.qpos0.copy(), self.model.qpos0.copy()
         velocities = np.zeros(self.model.nv)
-        for displacement, reached, start in zip(displacements, pose, reference, strict=True):
-            before[self.positions], after[self.positions] = start, reached
-            mujoco.mj_differentiatePos(self.model, velocities, 1.0, before, after)
+        for displacement, end_pose, start_pose in zip(displacements, pose, reference, strict=True):
+            start[self.positions], end[self.positions] = start_pose, end_pose
+            mujoco.mj_differentiatePos(self.model, velocities, 1.0, start, end)
             displacement[:] = velocities[self.velocities]
         return displacements
 

@@ -116,8 +116,13 @@ def list_changed_options(
 ) -> dict[str, tuple[float, float]]:
     """Return the options in which settings differ from the robot's model file.
 
+    Args:
+        robot: robot as read from its model file.
+        settings: settings in use; solver options that they do not state are those of the file.
+
     Returns:
-        Number in the file and number in use, by the effect that names the option.
+        Number in the file and number in use, by the effect that names the option, such as
+        ``numerics.step``.
     """
     options = settings.to_model_options()
     return {
@@ -162,6 +167,7 @@ def specifies_integrator(robot: RobotModel) -> bool:
     robot alone, unless it contains options of MuJoCo other than the defaults, or the table
     ``[engine]`` of the recording states them.
     """
+    # The table [engine] of the recording.
     is_stated = bool({"timestep", "integrator"} & set(robot.engine_table))
     is_default = read_integrator_settings(robot) == DEFAULT_SETTINGS
     return robot.format == "mjcf" or is_stated or not is_default

@@ -59,7 +59,7 @@ def close_loops(
     """
     import mujoco
 
-    # 1. Model and initial state.
+    # 1. Model and initial state. Without equality constraints (`neq`) there are no loops.
     if not unmeasured or not robot.compiled.neq:
         return dict(states)
     loops = _LoopModel(robot, states, unmeasured)
@@ -68,6 +68,7 @@ def close_loops(
     # and the unmeasured ones follow. In the reference pose of a file, a linkage may be stretched,
     # so that two motions are possible; the ranges of its joints tell which one is meant.
     reference = np.clip(model.qpos0, *loops.ranges)
+    # Displacement from the reference pose to the given one; only the measured joints make it.
     change = np.zeros(model.nv)
     mujoco.mj_differentiatePos(model, change, 1.0, reference, data.qpos)
     change[dofs] = 0.0
@@ -79,7 +80,7 @@ def close_loops(
         jacobian = _solve_constraints(loops)
     if jacobian is None:
         return dict(states)
-    # 3. Velocities: v_u = -J_u^+ J_m v_m.
+    # 3. Velocities: v_u = -J_u^+ J_m v_m. With v_u = 0, the product J v is J_m v_m.
     data.qvel[dofs] = 0.0
     data.qvel[dofs] = -np.linalg.pinv(jacobian[:, dofs]) @ (jacobian @ data.qvel)
     return {**states, **loops.get_unmeasured_states()}
@@ -108,14 +109,18 @@ def settle_loops(
         return dict(states)
     loops = _LoopModel(robot, states, unmeasured)
     model, data = loops.model, loops.data
+    # Go back in time with constant velocities, and close the loops there.
     steps = max(round(SETTLING_SECONDS / model.opt.timestep), 1)
     mujoco.mj_integratePos(model, data.qpos, data.qvel, -steps * model.opt.timestep)
     if _solve_constraints(loops) is None:
         return dict(states)
+    # Simulate until the measured joints are in their given state again.
     loops.guide_measured_joints()
     with capture_mujoco_warnings() as warnings:
         mujoco.mj_step(model, data, steps)
-    return {**states, **({} if warnings else loops.get_unmeasured_states())}
+    if warnings:  # the simulation is unstable
+        return dict(states)
+    return {**states, **loops.get_unmeasured_states()}
 
 
 def follow_measured_joints(
@@ -143,14 +148,18 @@ def follow_measured_joints(
     model, data = loops.model, loops.data
     loops.guide_measured_joints()
     model.opt.timestep = step
-    followed = positions.copy(), velocities.copy()
+    new_positions, new_velocities = positions.copy(), velocities.copy()
     with capture_mujoco_warnings() as warnings:
         for k in range(len(positions) - 1):
-            data.qpos[:], data.qvel[:] = followed[0][k], followed[1][k]
+            # The result of a step counts for the unmeasured joints only; all others have the given
+            # state at the next step.
+            data.qpos[:], data.qvel[:] = new_positions[k], new_velocities[k]
             mujoco.mj_step(model, data)
-            followed[0][k + 1, loops.addresses] = data.qpos[loops.addresses]
-            followed[1][k + 1, loops.dofs] = data.qvel[loops.dofs]
-    return (positions, velocities) if warnings else followed
+            new_positions[k + 1, loops.addresses] = data.qpos[loops.addresses]
+            new_velocities[k + 1, loops.dofs] = data.qvel[loops.dofs]
+    if warnings:
+        return positions, velocities
+    return new_positions, new_velocities
 
 
 class _LoopModel:
@@ -175,10 +184,12 @@ class _LoopModel:
             unmeasured: names of the unmeasured joints.
         """
         self.model, self.data = _make_dense_data(robot)
+        # Addresses of the unmeasured joints by the names of their positions and velocities.
         addresses: dict[str, int] = {}
         dofs: dict[str, int] = {}
         self.ranges = np.full((2, self.model.nq), [[-np.inf], [np.inf]])
         for joint in robot.joints:
+            # The names of a joint's positions (and velocities) have consecutive addresses.
             positions, velocities = list_state_units(joint)
             joint_addresses = dict(zip(positions, count(joint.position), strict=False))
             joint_dofs = dict(zip(velocities, count(joint.velocity), strict=False))
@@ -233,9 +244,10 @@ def list_joints_placed_by_loops(robot: RobotModel) -> list[Joint]:
     jacobian = _get_equality_jacobian(model, data)
     placed = []
     for joint in floating:
-        size = len(list_state_units(joint)[1])
-        columns = jacobian[:, joint.velocity : joint.velocity + size]
-        if np.linalg.matrix_rank(columns) >= size - 1:
+        _, velocity_units = list_state_units(joint)
+        dof_count = len(velocity_units)
+        columns = jacobian[:, joint.velocity : joint.velocity + dof_count]
+        if np.linalg.matrix_rank(columns) >= dof_count - 1:
             placed.append(joint)
     return placed
 
@@ -335,11 +347,8 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
             # Ancestors of one of the bodies only are those below the common ancestor.
             first_ancestors = _list_ancestors(model, first_object)
             second_ancestors = _list_ancestors(model, second_object)
-            coupled_dofs = [
-                dof
-                for body in set(first_ancestors) ^ set(second_ancestors)
-                for dof in _get_dofs(model, body)
-            ]
+            chain = set(first_ancestors) ^ set(second_ancestors)
+            coupled_dofs = [dof for body in chain for dof in _get_dofs(model, body)]
         else:
             continue
         # Merge the group with all former ones that share a joint with it.

@@ -145,11 +145,13 @@ def _make_finder(name: str, *index: int) -> Find:
     """
 
     def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
+        """Return the only element of the only coefficient at the joint or body `place`."""
         if name.startswith("body_"):
             return [[ModelField(name, (robot.body(place).id, *index))]]
         joint = robot.joint(place)
-        rows = {"dof": joint.velocity, "jnt": joint.id, "qpos0": joint.position}
-        return [[ModelField(name, (rows[name.partition("_")[0]], *index))]]
+        row_by_prefix = {"dof": joint.velocity, "jnt": joint.id, "qpos0": joint.position}
+        prefix, _, _ = name.partition("_")
+        return [[ModelField(name, (row_by_prefix[prefix], *index))]]
 
     return find
 
@@ -271,10 +273,10 @@ def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
         c: (1, L) coefficient in N m or N.
     """
     dof = robot.joint(place).velocity
-    loss = fields["dof_frictionloss"]
+    friction = fields["dof_frictionloss"]
+    friction[:, dof] = add_to_file_value(friction[:, dof], c[0])
     # A reduced friction keeps the solver parameters of the file.
     has_added_friction = c[0] > 0
-    loss[:, dof] = add_to_file_value(loss[:, dof], c[0])
     write_friction_form(fields, robot, has_added_friction, dof)
 
 
@@ -346,8 +348,9 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         c: (K, L) components of r in rad: all three, or only those that change the motion.
     """
     joint_id = robot.joint(place).id
+    # The n batch elements with a rotation; only their axes change.
     tilted_elements = np.flatnonzero(c.any(axis=0))
-    axis = fields["jnt_axis"][tilted_elements, joint_id]
+    axis = fields["jnt_axis"][tilted_elements, joint_id]  # (n, 3)
     rotation_vector = np.zeros(axis.shape)
     components = range(3) if len(c) == 3 else observable_tilts(robot, place)
     rotation_vector[:, list(components)] = c[:, tilted_elements].T
@@ -358,10 +361,9 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         np.cos(angle) * axis
         + np.sin(angle) * np.cross(unit_vector, axis)
         + (1.0 - np.cos(angle)) * projection * unit_vector
-    )  # (6)
-    fields["jnt_axis"][tilted_elements, joint_id] = rotated / np.linalg.norm(
-        rotated, axis=1, keepdims=True
     )
+    length = np.linalg.norm(rotated, axis=1, keepdims=True)
+    fields["jnt_axis"][tilted_elements, joint_id] = rotated / length
 
 
 def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
@@ -397,16 +399,18 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
             body frame.
     """
     body_id = robot.body(place).id
+    # The n batch elements with a payload: its mass (n,), and its place (n, 3) in the body frame.
     loaded = np.flatnonzero(c[0])
+    payload = c[0, loaded]
     point = robot.compiled.body_ipos[body_id] + c[1:, loaded].T
     mass, centre = fields["body_mass"][loaded, body_id], fields["body_ipos"][loaded, body_id]
-    total = mass + c[0, loaded]
-    new_centre = (mass[:, None] * centre + c[0, loaded, None] * point) / total[:, None]
+    total = mass + payload
+    new_centre = (mass[:, None] * centre + payload[:, None] * point) / total[:, None]
     tensor = compute_inertia_tensors(
         fields["body_iquat"][loaded, body_id], fields["body_inertia"][loaded, body_id]
     )
     tensor += mass[:, None, None] * compute_point_inertias(centre - new_centre)
-    tensor += c[0, loaded, None, None] * compute_point_inertias(point - new_centre)  # (7)
+    tensor += payload[:, None, None] * compute_point_inertias(point - new_centre)
     moments, axes = compute_principal_axes(tensor)
     fields["body_mass"][loaded, body_id] = total
     fields["body_ipos"][loaded, body_id] = new_centre
@@ -429,12 +433,13 @@ def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     actuator_id = robot.actuator(place).id
     is_limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
     has_limit = c[0] > 0
-    # The file states no range for these elements.
+    # Where the model has no limit, its range has no meaning and counts as infinite.
     is_unlimited = has_limit & ~is_limited[:, actuator_id].astype(bool)
     ranges[is_unlimited, actuator_id] = (-np.inf, np.inf)
-    force_range = np.stack([-c[0], c[0]], axis=1)[has_limit]
+    new_range = np.stack([-c[0], c[0]], axis=1)[has_limit]
     low, high = ranges[has_limit, actuator_id].T
-    ranges[has_limit, actuator_id] = np.clip(force_range, low[:, None], high[:, None])  # (5)
+    # Both ends are moved into the present range, which gives the intersection or the nearer end.
+    ranges[has_limit, actuator_id] = np.clip(new_range, low[:, None], high[:, None])
     is_limited[has_limit, actuator_id] = True
 
 
@@ -468,9 +473,11 @@ def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
     geom, model = find_geom(robot, place), robot.compiled
     is_ellipsoid = int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
+    # A view of the sizes to scale: three half axes, or the radius, the first of three sizes.
     size = fields["geom_size"][:, geom, : 3 if is_ellipsoid else 1]
     growth = np.maximum(compute_factor(c[0]) - 1.0, 0.0) * size.max(axis=1)
     size *= compute_factor(c[0])[:, None]
+    # Radius of the bounding sphere, and half axes of the bounding box, whose centre comes first.
     fields["geom_rbound"][:, geom] += growth
     fields["geom_aabb"][:, geom, 3:] += growth[:, None]
     # Volumes of the geom's body in the bounding volume hierarchy; columns are centre and half axes.
@@ -493,11 +500,12 @@ def _scale_solref(index: int) -> FieldWriter:
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         """Scale the parameters of the pair of geoms `place`, by c (1, L) for L batch elements."""
         solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])
-        direct = solref[:, 0] <= 0
-        solref[~direct, index] *= factor[~direct]
-        solref[direct, 0] *= factor[direct] ** -2
+        is_direct = solref[:, 0] <= 0  # stiffness and damping, (L,)
+        solref[~is_direct, index] *= factor[~is_direct]
+        # A change of t or z changes k by the inverse square of the factor, and one of t also b.
+        solref[is_direct, 0] *= factor[is_direct] ** -2
         if index == 0:
-            solref[direct, 1] /= factor[direct]
+            solref[is_direct, 1] /= factor[is_direct]
 
     return write
 

@@ -159,9 +159,10 @@ def strip_shapes(robot: RobotModel) -> RobotModel:
     try:
         spec.discard_visual()
         stripped_robot = replace(robot, spec=spec)
-        return stripped_robot if stripped_robot.compiled.nq == robot.compiled.nq else robot
-    except ValueError:
+        has_equal_coordinates = stripped_robot.compiled.nq == robot.compiled.nq
+    except ValueError:  # MuJoCo's compiler needs the shapes.
         return robot
+    return stripped_robot if has_equal_coordinates else robot
 
 
 def _needs_shapes(model: Any) -> bool:
@@ -192,10 +193,16 @@ def _needs_shapes(model: Any) -> bool:
 def _write_inertials(spec: Any, model: Any) -> None:
     """Write the masses and inertias of the compiled model into a spec.
 
-    The masses then no longer depend on geoms, which can be removed without changing the motion.
+    The masses then do not depend on geoms, which can be removed without changing the motion.
+
+    Args:
+        spec: the model as an `MjSpec`, changed in place.
+        model: the model, compiled from it.
     """
     import mujoco
 
+    # Settings of the compiler that would change stated masses: computing them from geoms, repairing
+    # or bounding them, and scaling them to a total mass.
     for compiler in (spec.compiler, *(body.compiler for body in spec.bodies)):
         compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         compiler.balanceinertia = False
@@ -203,11 +210,13 @@ def _write_inertials(spec: Any, model: Any) -> None:
         compiler.settotalmass = -1.0
     for body in spec.bodies:
         body_id = body.id
+        # Body 0 is the world.
         body.explicitinertial = bool(body_id and model.body_mass[body_id] > 0)
         if not body.explicitinertial:
             continue
         body.mass, body.inertia = float(model.body_mass[body_id]), model.body_inertia[body_id]
         body.ipos, body.iquat = model.body_ipos[body_id], model.body_iquat[body_id]
+        # Other forms of a tensor and of an orientation would take precedence.
         body.fullinertia = np.full(6, np.nan)
         body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
@@ -247,6 +256,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
         mesh = int(model.geom_dataid[geom_id])
         kind = mujoco.mjtGeom(int(model.geom_type[geom_id]))
         if kind != mujoco.mjtGeom.mjGEOM_MESH:
+            # The compiler has fitted a primitive.
             geom.type, geom.size, geom.meshname = kind, model.geom_size[geom_id], ""
         elif is_tested_version and collision_mask[geom_id] and model.mesh_facenum[mesh] > MIN_FACES:
             hull = hull_by_mesh.get(geom.meshname) or read_hull(model, mesh)
@@ -254,7 +264,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
                 continue
             hull_by_mesh[geom.meshname] = hull
         else:
-            continue
+            continue  # The geom stays as it is.
         # The compiler may have moved the frame of the mesh, so the compiled pose is stated.
         geom.set_frame(geom.parent.add_frame())
         geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
@@ -277,19 +287,19 @@ def _has_equal_motion(model: Any, reduced_model: Any, numbers: Mapping[str, int]
         reduced_model: model with some of its geoms.
         numbers: numbers of the whole model's geoms, by geom name.
     """
-    # Geoms have other numbers in the reduced model, so those of the whole model are reordered.
-    geom_numbers = [numbers[reduced_model.geom(i).name] for i in range(reduced_model.ngeom)]
     fields = {
         name: getattr(model, name)
         for name in dir(model)
         if not name.startswith(("_", *IGNORED_FIELD_PREFIXES))
     }
     for name, values in fields.items():
-        is_number = isinstance(values, np.ndarray) and values.dtype.kind == "f"
-        if is_number and not np.array_equal(values, getattr(reduced_model, name), equal_nan=True):
+        has_floats = isinstance(values, np.ndarray) and values.dtype.kind == "f"
+        if has_floats and not np.array_equal(values, getattr(reduced_model, name), equal_nan=True):
             return False
     if model.stat.meaninertia != reduced_model.stat.meaninertia:
         return False
+    # Geoms have other numbers in the reduced model, so those of the whole model are reordered.
+    geom_numbers = [numbers[reduced_model.geom(i).name] for i in range(reduced_model.ngeom)]
     return all(
         np.array_equal(getattr(model, field)[geom_numbers], getattr(reduced_model, field))
         for field in GEOM_FIELDS

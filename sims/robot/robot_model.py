@@ -290,10 +290,14 @@ class RobotModel:
         )
 
     def _describe_actuator(self, i: int) -> Actuator:
-        """Describe actuator number i of the compiled model: what it drives, and its limits."""
+        """Describe actuator number i of the compiled model: what it drives, and its limits.
+
+        MuJoCo calls what an actuator drives its transmission: a joint, a tendon, a site or others.
+        """
         import mujoco
 
         model = self.compiled
+        # Type of the transmission, and number of the joint, tendon or site.
         transmission, target = int(model.actuator_trntype[i]), int(model.actuator_trnid[i, 0])
         # The joint that it drives. The tendon of a coupled drive stands for the drive's own joint.
         joint = None
@@ -302,11 +306,12 @@ class RobotModel:
         if self.coupled and transmission == int(mujoco.mjtTrn.mjTRN_TENDON):
             coupled_joint = model.tendon(target).name.removesuffix(COUPLING_TENDON_SUFFIX)
             joint = coupled_joint if coupled_joint in self.coupled else None
-        # Its controls. Before MuJoCo 4 each actuator had one control.
-        control, controls = i, 1
+        # Address of its first control, and number of its controls. Before MuJoCo 4 each actuator
+        # had one control.
+        control, control_count = i, 1
         if hasattr(model, "actuator_ctrladr"):
-            control, controls = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])
-        is_limited = controls > 0 and bool(model.actuator_ctrllimited[control])
+            control, control_count = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])
+        is_limited = control_count > 0 and bool(model.actuator_ctrllimited[control])
         # Whether it acts along an angle or a length; neither if its tendon moves joints of both
         # kinds.
         moved_joints = self._get_tendon_joints(i)
@@ -330,7 +335,7 @@ class RobotModel:
             range=_get_limit(model.actuator_ctrlrange[control], True) if is_limited else None,
             force=_get_limit(model.actuator_forcerange[i], bool(model.actuator_forcelimited[i])),
             control=control,
-            controls=controls,
+            controls=control_count,
             motion=motion,
             moves=moved_joints if joint is None else (),
         )
@@ -359,7 +364,8 @@ class RobotModel:
     def bodies(self) -> tuple[Body, ...]:
         """Bodies that joints move, directly or through other bodies.
 
-        Their aliases are the links that are fused into them.
+        Their aliases are the links that are fused into them: MuJoCo merges links on fixed joints
+        into one body.
         """
         model = self.compiled
         fused_names: dict[str, list[str]] = {}
@@ -385,6 +391,7 @@ class RobotModel:
         for sensor_id in range(model.nsensor):
             name = model.sensor(sensor_id).name
             begin, count = int(model.sensor_adr[sensor_id]), int(model.sensor_dim[sensor_id])
+            # Vectors and quaternions have axes, other numbers are counted.
             suffixes = {3: "xyz", 4: "wxyz"}.get(count) or map(str, range(count))
             name_endings = [""] if count == 1 else [f".{suffix}" for suffix in suffixes]
             unit = self._get_sensor_unit(sensor_id)
@@ -487,7 +494,11 @@ def _detect_actuator_kind(model: Any, i: int) -> ActuatorKind:
     """Return the kind of an actuator from its gain and bias (MuJoCo's shortcuts).
 
     The force of an actuator with a constant gain g and an affine bias is
-    g * control + b_0 + b_1 * position + b_2 * velocity.
+    g * control + b_0 + b_1 * position + b_2 * velocity. So it is
+
+    * a motor without bias: g * control,
+    * a position servo with b_1 = -g: g (control - position) + b_2 * velocity,
+    * a velocity servo with b_2 = -g and b_1 = 0: g (control - velocity).
 
     Args:
         model: compiled model.
@@ -498,13 +509,13 @@ def _detect_actuator_kind(model: Any, i: int) -> ActuatorKind:
     gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
     has_constant_gain = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
     has_affine_bias = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    # A first-order filter before the actuator changes when a control acts, but not its meaning.
     dynamics = int(model.actuator_dyntype[i])
-    # A filter changes when a control acts, but not its meaning.
-    has_no_lag = dynamics == int(mujoco.mjtDyn.mjDYN_NONE) or dynamics in filters()
+    keeps_meaning = dynamics == int(mujoco.mjtDyn.mjDYN_NONE) or dynamics in filters()
     pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # Available since MuJoCo 4.
     if pid is not None and int(model.actuator_gaintype[i]) == int(pid):
         return "pid"
-    if not has_constant_gain or not has_no_lag:
+    if not has_constant_gain or not keeps_meaning:
         return "other"
     if not has_affine_bias or not np.any(bias[:3]):
         return "motor"

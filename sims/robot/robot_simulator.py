@@ -104,8 +104,12 @@ class RobotSimulator(SystemSimulator):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         """Create the simulator, and check that no number of the model is a parameter twice.
 
-        A coefficient may be freed in the model itself (`free`) or belong to a given effect,
-        but not both.
+        A coefficient, such as a joint's damping, may be freed in the model itself (`free`) or
+        belong to an effect that the caller gives, but not both. The arguments are those of
+        `SystemSimulator`.
+
+        Raises:
+            InputError: a number is a parameter twice.
         """
         super().__init__(*args, **kwargs)
         repeated_names = [
@@ -193,17 +197,22 @@ class RobotSimulator(SystemSimulator):
         created with. A family, one effect at all places, is divided into its members.
 
         Args:
-            theta: (L, P) parameters: first the free ones, then coefficients of effects.
+            theta: (L, P) P parameters of L batch elements: first the free ones, then coefficients
+                of effects.
+
+        Returns:
+            Effects with their coefficients (K, L, 1).
         """
-        acting: list[tuple[Effect, Array]] = []
+        effects: list[tuple[Effect, Array]] = []
         column = 0
         for effect in self._freed:
             count = len(effect.coefficients)
             c = theta[:, column : column + count].T[:, :, None]  # (K, L, 1)
-            acting.append((effect, c))
+            effects.append((effect, c))
             column += count
-        acting += super()._make_active_effects(theta)
-        placed_effects = [placed for effect, c in acting if c.any() for placed in effect.parts(c)]
+        effects += super()._make_active_effects(theta)
+        placed_effects = [placed for effect, c in effects if c.any() for placed in effect.parts(c)]
+        # A member of a family may be zero although the family is not.
         return tuple((effect, c) for effect, c in placed_effects if c.any())
 
     def get_active_effects(self, theta: Array) -> ActiveEffects:
@@ -222,18 +231,19 @@ class RobotSimulator(SystemSimulator):
     def _simulate_observations(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
-        """Simulate observations (L, T, C) of L batch elements, see `SystemSimulator`.
+        """Simulate observations (L, T, C) of L batch elements at T samples of C channels.
 
         Elements with equal scenarios are one run, whose inputs are computed once.
 
         Args:
-            theta: (L, P) parameters.
+            theta: (L, P) values of the P parameters.
             scenarios: scenario of each element.
             initial: initial states by name, (L,) each.
         """
         acting = self._make_active_effects(theta)
         runs = group_scenarios(scenarios, by_initial=True)
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
+        # Initial positions and velocities (L, D). A robot has no constants, the first result.
         _, x, v = self._collect_known_values(scenarios, initial)
         return self._simulate_elements(acting, runs, commands, x, v)
 
@@ -306,7 +316,7 @@ class RobotSimulator(SystemSimulator):
             Observations (n, T, C) of each run: n elements, T samples, C channels.
         """
         # A sensor at the end needs a further step, since MuJoCo computes its reading within the
-        # step that begins then.
+        # step that begins then. Without sensors no step is added.
         extra_steps = int(self._reads_sensors())
         step_counts = [self.count_steps(list_last_read_times(batch)) for batch in run_batches]
         run_inputs = [
@@ -333,6 +343,12 @@ class RobotSimulator(SystemSimulator):
         """Return the initial poses and velocities of floating bodies, run after run.
 
         All batch elements of a run begin in the same state, which is repeated for each of them.
+
+        Args:
+            run_batches: batch elements of each run.
+
+        Returns:
+            Poses (L, P) and velocities (L, F) of the L elements of all runs.
         """
         poses, rates = zip(*map(self.get_floating_start, run_batches), strict=True)
         sizes = [len(batch.x) for batch in run_batches]
@@ -381,7 +397,7 @@ class RobotSimulator(SystemSimulator):
             batch: batch elements of the run.
             steps: number of steps.
         """
-        # 1. Applied inputs.
+        # 1. Applied inputs (n, S) by name.
         batch_size = len(batch.x)
         compute_inputs = partial(
             compute_inputs_over_steps,
@@ -413,7 +429,7 @@ class RobotSimulator(SystemSimulator):
                 )
                 controls[:, :, actuator.control + 1] = rate
                 instant_controls[:, :, actuator.control + 1] = rate
-        # 3. Forces.
+        # 3. Forces: those that are inputs, and those of effects that depend on time alone.
         forces = np.zeros((batch_size, steps, model.nv))
         for joint in self.robot.joints:
             if joint.has_one_coordinate:
@@ -459,28 +475,29 @@ class RobotSimulator(SystemSimulator):
             batch: batch elements of the run.
             controls: (n, S) controls of the filter in the S steps of the run.
         """
+        # 1. Stated value, by the filter's name among the initial states.
         stated_activations = select_initial_activations(self.robot, batch.scenario.initial)
         if activation_filter.state in stated_activations:
             return np.full(len(batch.x), stated_activations[activation_filter.state])
+        # 3. Without known commands before the run, the filter has settled.
         history = extend_into_past(batch.scenario, self.time_step)
         if history is None:
             settled_activation: Array = np.clip(
                 activation_filter.clip_controls(controls[:, 0]), *activation_filter.limits
             )
             return settled_activation
-        # The filter has settled at the first of the commands before the run.
-        scenario, steps = history
+        # 2. The filter has settled at the first of the commands before the run.
+        scenario, steps_before_run = history
         commands = self.run_inputs(scenario)
-        n = len(batch.x)
         applied_inputs = compute_inputs_over_steps(
-            self.time_step, scenario, commands, batch.acting, n, steps
+            self.time_step, scenario, commands, batch.acting, len(batch.x), steps_before_run
         )
         earlier_controls = applied_inputs[f"u.{activation_filter.actuator.name}"]
-        last_activation: Array = self._integrate_activations(
-            activation_filter,
-            earlier_controls,
-            activation_filter.clip_controls(earlier_controls[:, 0]),
-        )[:, -1]
+        first_activation = activation_filter.clip_controls(earlier_controls[:, 0])
+        activations = self._integrate_activations(
+            activation_filter, earlier_controls, first_activation
+        )
+        last_activation: Array = activations[:, -1]
         return last_activation
 
     def _integrate_activations(
@@ -514,13 +531,15 @@ class RobotSimulator(SystemSimulator):
     def make_linearisation_batch(self, acting: ActiveEffects = ()) -> MujocoBatch:
         """Return the batch for linearisation, with the elements that effects add to the model.
 
-        Its elements are points of one motion, so all of them have the same effects.
+        Its elements are points of one motion, so all of them have the same effects. The effects may
+        change masses, so MuJoCo derives constants from them again.
 
         Args:
             acting: effects active in the motion, with coefficients (K, 1, 1).
         """
+        # One batch element makes one group.
         (added,) = group_by_added_elements(acting, 1)
-        return self._get_batch(True, LINEARISATION_BATCH_SIZE, added)
+        return self._get_batch(derived=True, count=LINEARISATION_BATCH_SIZE, added=added)
 
     def make_half_step_batch(self, acting: ActiveEffects = ()) -> MujocoBatch:
         """Return the batch of `make_linearisation_batch` with half the time step."""
@@ -559,17 +578,19 @@ class RobotSimulator(SystemSimulator):
             inputs: controls, forces and activations over the steps.
             extra_fields: additional fields of MuJoCo's data to record.
         """
-        # 1. Batch.
+        # 1. Batch. All elements need the same added elements, so that there is one group.
         batch_size = len(start.x)
-        derived = bool(
+        changes_constants = bool(
             find_active_elements(start.acting, batch_size, changes_derived_constants).any()
         )
         (added,) = group_by_added_elements(start.acting, batch_size)
         # A single simulation uses a small batch, so that constants need not be derived for a whole
         # one.
-        mujoco_batch = self._get_batch(derived, 1 if batch_size == 1 else BATCH_SIZE, added)
+        mujoco_batch = self._get_batch(
+            changes_constants, 1 if batch_size == 1 else BATCH_SIZE, added
+        )
         joints, series_joints = mujoco_batch.file_joints, mujoco_batch.series_joints
-        # 2. Effects and initial states.
+        # 2. Effects and initial states. Elements of the batch that are not in use have no effects.
         mujoco_batch.write_effects(
             pad_coefficients(
                 select_model_field_effects(start.acting), batch_size, mujoco_batch.count
@@ -584,7 +605,11 @@ class RobotSimulator(SystemSimulator):
         field_names = list(dict.fromkeys(field_names))
         forces = mujoco_batch.map_forces(inputs.forces)
         if find_active_elements(start.acting, batch_size, is_evaluated_per_step).any():
-            servos = mujoco_batch.robot, joints.velocities, inputs.off
+            working_servos = None  # all of them in all steps
+            if inputs.off.any():
+                working_servos = find_working_servos(
+                    mujoco_batch.robot, joints.velocities, inputs.off
+                )
             step_forces = StepForces(
                 self.robotic,
                 start.acting,
@@ -592,7 +617,7 @@ class RobotSimulator(SystemSimulator):
                 joints,
                 mujoco_batch.get_servo_stiffness(joints)[:batch_size],
                 self.time_step,
-                working=find_working_servos(*servos) if inputs.off.any() else None,
+                working=working_servos,
             )
             recorded_fields = step_with_forces(
                 mujoco_batch, inputs.controls, forces, step_forces, field_names, inputs.off
@@ -606,6 +631,7 @@ class RobotSimulator(SystemSimulator):
         v = np.concatenate(
             [start.v[:, None], recorded_fields["qvel"][:, :, joints.velocities]], axis=1
         )
+        # MuJoCo no longer moves failed elements, such as those whose motion diverges.
         x[mujoco_batch.failed] = np.nan
         if self._records_drive_forces:
             sensor_model = DriveSensorModel(
@@ -650,7 +676,7 @@ class RobotSimulator(SystemSimulator):
             steps: number of steps of the run; the batch may have more.
         """
         columns = []
-        clock = float(batch.scenario.times[0])
+        clock = float(batch.scenario.times[0])  # time stamp of the start
         for channel in self.channels:
             values, slopes = self._get_channel_values(result_of_batch, channel.name, steps)
             # An effect without a signal acts on all channels.
@@ -678,7 +704,7 @@ class RobotSimulator(SystemSimulator):
             The values, and for a position their slopes (n, S + 1), the velocities; otherwise None.
         """
         kind, _, element_name = name.partition(".")
-        steps_of_run = slice(steps + 1)
+        steps_of_run = slice(steps + 1)  # the batch may have more
         if kind in ("q", "qd"):
             number = self.system.coordinates.index(f"q.{element_name}")
             velocities = result.v[:, steps_of_run, number]
@@ -702,7 +728,7 @@ def make_robot_simulator(
 
     Args:
         robot: robot as read from its model file.
-        free: values of the model file that become parameters, such as ``damping@*`` (of all
+        free: numbers of the model file that become parameters, such as ``damping@*`` (of all
             joints) or ``mass@forearm``.
         numerics: time step and integrator; those of the file if None.
 

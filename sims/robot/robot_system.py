@@ -96,10 +96,11 @@ class RobotSystem(System):
     def close_loops(
         cls, states: Mapping[str, float], measured: Collection[str]
     ) -> dict[str, float]:
-        """Return states in which the loops of the robot are closed, see `System`.
+        """Return states in which the closed loops of the robot are closed, see `System`.
 
-        Joints in loops that are not measured are placed where the loops put them, also rods with
-        ball joints.
+        A closed loop is a chain of links whose ends the model connects. Joints in loops that are
+        not measured are placed where the loops put them, also rods with ball joints. Those that the
+        measured ones move then settle: MuJoCo's loops give way a little under load.
 
         Args:
             states: initial states by name.
@@ -113,19 +114,21 @@ class RobotSystem(System):
 
     @classmethod
     def list_following_joints(cls, measured: Collection[str]) -> list[str]:
-        """Return the names of unmeasured joints that the measured ones of their loop move.
+        """Return the names of unmeasured joints that the measured ones of their closed loop move.
 
-        A loop without a measured joint moves by its drives, and one with a drive at an unmeasured
-        joint by both.
+        The result has no joints of a loop without a measured joint, since its drives move it; and
+        none of a loop with a drive at an unmeasured joint, since this drive moves it, too.
 
         Args:
             measured: names of the measured states, such as ``q.crank`` and ``q.rod.qw``.
         """
+        # An actuator drives one joint, or those of its tendon.
         driven = {joint for a in cls.robot.actuators for joint in (a.joint, *a.moves)}
         following = list[str]()
         for loop in cls.joint_loops:
             unmeasured = cls._list_unmeasured(loop, measured)
-            if len(unmeasured) < len(loop) and driven.isdisjoint(unmeasured):
+            has_measured_joint = len(unmeasured) < len(loop)
+            if has_measured_joint and driven.isdisjoint(unmeasured):
                 following += unmeasured
         return following
 
@@ -133,30 +136,32 @@ class RobotSystem(System):
     def _list_unmeasured(cls, joints: Collection[str], measured: Collection[str]) -> list[str]:
         """Return the names of those joints of a loop that are not measured, sorted.
 
+        A joint counts as measured if any of its positions or velocities is.
+
         Args:
             joints: names of the joints, of any kind.
-            measured: names of the measured states.
+            measured: names of the measured states, such as ``q.crank``.
         """
-        return [
-            name
-            for name in sorted(joints)
-            if not any(
-                set(units).intersection(measured)
-                for units in list_state_units(cls.robot.joint(name))
-            )
-        ]
+        unmeasured = []
+        for name in sorted(joints):
+            position_units, velocity_units = list_state_units(cls.robot.joint(name))
+            states = {*position_units, *velocity_units}  # their names
+            if states.isdisjoint(measured):
+                unmeasured.append(name)
+        return unmeasured
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
         """Return the classes of an effect at each of its places, and of its family, if any.
 
-        Left out are places where the effect's coefficient is a free parameter of the simulator.
-        A payload is also left out on a body whose mass is free, since the log cannot tell the
-        two masses apart.
+        A family is one effect at all of its places. Left out are places where the effect's
+        coefficient is a free parameter of the simulator. A payload is also left out on a body whose
+        mass is free, since the log cannot tell the two masses apart.
 
         Args:
-            effect: registered effect.
+            effect: registered effect, such as dry friction.
         """
+        # The classes at all places are made once.
         if effect.name not in cls._placed:
             cls._placed[effect.name] = tuple(
                 placed_effect_classes.make_effect_classes(
@@ -180,7 +185,11 @@ class RobotSystem(System):
     def _compiles_with(cls, effect: type[Effect]) -> bool:
         """Return whether the model compiles with the elements that an effect at one place adds.
 
-        If not, MuJoCo's reason is stored in `left_out` for messages.
+        An effect may add an element, such as a second joint. If the model does not compile with it,
+        MuJoCo's reason is stored in `left_out` for messages.
+
+        Args:
+            effect: class of the effect at its place.
         """
         added = list_added_elements(effect)
         # Most effects add no elements, and a pair of existing geoms always compiles.
@@ -211,6 +220,9 @@ class RobotSystem(System):
         Args:
             name: Name of the effect, with its place after ``@``.
 
+        Returns:
+            Class of the effect at its place; a robot never returns None, which `System` allows.
+
         Raises:
             InputError: there is no such effect, or it has no such place; the message lists the
                 existing ones.
@@ -240,6 +252,7 @@ class RobotSystem(System):
                 + ", ".join(sorted(effects_by_name))
             )
         if registered.at == "body" and place in (cls.robot.aliases or {}):
+            # A link that is fused into a body: the effect acts on the whole body.
             return cls.effect(f"{effect_name}@{cls.robot.body(place).name}")
         place_names = [
             placed_effect.place for placed_effect in effects_by_name.values() if placed_effect.place
@@ -267,6 +280,7 @@ class RobotSystem(System):
             InputError: there is no such number, or it has no such place.
         """
         base, _, place = word.partition("@")
+        # Name of the effect that changes the number; `base` may be this name already.
         name = MUJOCO_EFFECT_WORDS.get(base, base)
         if name not in library.list_names():
             known_words = [
@@ -279,13 +293,12 @@ class RobotSystem(System):
             ]
             raise make_unknown_name_error(f"number of robot {cls.name}", base, known_words)
         placed_effect = cls.effect(f"{name}@{place}" if place else name)
-        assert placed_effect is not None
-        # Shared effects, such as delays, have one number for all places.
-        members = (
-            ()
-            if name in placed_effect_classes.SHARED_COEFFICIENT_EFFECTS
-            else getattr(placed_effect, "members", ())
-        )
+        assert placed_effect is not None  # an unknown place raises an error instead
+        # Shared effects, such as delays, have one number for all places, and are not divided.
+        if name in placed_effect_classes.SHARED_COEFFICIENT_EFFECTS:
+            return [placed_effect]
+        # Only a family, the effect at all places, has members.
+        members = getattr(placed_effect, "members", ())
         return [type(member) for member in members] or [placed_effect]
 
     @classmethod
@@ -316,6 +329,8 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     Raises:
         InputError: the robot has no joint with one coordinate, or a name in `free` does not exist.
     """
+    # 1. Joints, channels, inputs and initial states. The coordinates are those of the joints with
+    # one coordinate; free and ball joints only have initial states.
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     if not joints:
         floating_joint = robot.joints[0].name
@@ -333,21 +348,25 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     floating = FloatingJoints.from_robot(robot)
     states |= floating.states()
     floating_state_units = floating.units()
+    # 2. Closed loops. The pose of some floating joints follows from the loop, so a recording need
+    # not state it.
     placed_joints = list_joints_placed_by_loops(robot)
     loop_joints = [*joints, *placed_joints]
     placed_states = {
         name for joint in placed_joints for units in list_state_units(joint) for name in units
     }
+    # 3. Actuators of each joint. With several servos at one joint, its motion would not show which
+    # one has an error.
     actuators_by_coordinate = {
         coordinate: [a for a in robot.actuators if a.joint == joint.name]
         for coordinate, joint in enumerate(joints)
     }
-    # With several servos at one joint, its motion would not show which one has an error.
     servo_by_coordinate = {
         coordinate: servos[0]
         for coordinate, actuators in actuators_by_coordinate.items()
         if len(servos := [a for a in actuators if a.kind == "position"]) == 1
     }
+    # 4. Class with these attributes.
     attributes: dict[str, Any] = {
         "name": robot.name,
         "says": f"the robot of {robot.path.name}",
@@ -432,12 +451,16 @@ def _make_parameters(effect: type[Effect]) -> list[Parameter]:
 
     A coefficient is a change of a number of the model file. Its nominal value zero keeps the file's
     number, and its bounds are a multiple of the plausible range.
+
+    Args:
+        effect: effect at one place whose coefficients the user frees.
     """
     parameters = []
     for coefficient in effect.coefficients:
         # Units and ranges are equal for all kinds of systems, since the effect is at one place.
         low, high = coefficient.plausible[0]
-        # The gain of a servo is often a guess, so the true value may be several times as large.
+        # The gain of a servo is often a guess, so the true value may be several times as large. Its
+        # relative change has a lowest value; other coefficients of actuators have none.
         is_free_gain = effect.at == "actuator" and coefficient.least is not None
         bounds = (
             FREED_RANGE_FACTOR * low,

@@ -119,9 +119,11 @@ class RobotSnapshot(StateSnapshot):
             joint: index of the joint's coordinate.
         """
         joint_slice = slice(joint, joint + 1)  # keeps the axis of the joints
+        # Inputs by name: those of the actuators that drive the joint.
         inputs = {
             name: self.inputs[name] for name in self.drives.get(joint, ()) if name in self.inputs
         }
+        # Name of the input that is the set point of the joint's position servo, if there is one.
         servo = self.servos.get(joint)
         has_servo = servo is not None and servo in self.inputs and self.stiffness.size
         return JointSnapshot(
