@@ -46,10 +46,11 @@ def compute_centre_of_mass_limits(robot: RobotModel, body: str) -> Array:
     """
     model, data = robot.compiled, make_reference_data(robot.compiled)
     body_id = robot.body(body).id
+    # Corners of the box around the points, in the body's frame.
     points = np.array(list(_iterate_link_points(model, data, body_id)))
     low, high = points.min(axis=0), points.max(axis=0)
     longest_side = float((high - low).max()) or _estimate_link_length(model, body_id)
-    # A thin rod gets a thickness.
+    # A thin rod gets a thickness, and each face a margin.
     half_sizes = (
         np.maximum(0.5 * (high - low), MIN_THICKNESS_SHARE * longest_side)
         + MARGIN_SHARE * longest_side
@@ -66,7 +67,8 @@ def _iterate_link_points(model: Any, data: Any, body_id: int) -> Iterator[Array]
 
     They are its origin, its stated centre of mass, the corners of its geoms, its sites, such as
     those of rotors, and the origins of its child bodies. Without geoms they are also the corners of
-    the box that has its mass and inertia.
+    the box that has its mass and inertia. Bodies that are rigidly attached to it belong to the
+    link.
 
     Args:
         model: compiled model.
@@ -75,10 +77,11 @@ def _iterate_link_points(model: Any, data: Any, body_id: int) -> Iterator[Array]
     """
     import mujoco
 
+    # Points of the data are in the world: `axes.T @ (point - origin)` is a point in the link.
     origin, axes = data.xpos[body_id], data.xmat[body_id].reshape(3, 3)
     yield np.zeros(3)
     yield model.body_ipos[body_id]
-    # Planes and height fields are surroundings without a size of the link.
+    # Planes and height fields are surroundings, whose size is not that of the link.
     flat = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     bodies = _list_fixed_bodies(model, body_id)
     if not model.body_geomnum[bodies].any():
@@ -100,6 +103,7 @@ def _iterate_link_points(model: Any, data: Any, body_id: int) -> Iterator[Array]
             for corner in CUBE_CORNERS:
                 corner_point = centre + size * corner
                 yield axes.T @ (data.geom_xpos[geom] + geom_axes @ corner_point - origin)
+        # Child bodies on joints. The world, body 0, is its own parent.
         for child in np.flatnonzero(model.body_parentid == body):
             if child and model.body_jntnum[child]:
                 yield axes.T @ (data.xpos[child] - origin)

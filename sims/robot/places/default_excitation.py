@@ -142,13 +142,15 @@ def _compute_reference_forces(
     model = robot.compiled
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    bias = data.qfrc_bias - data.qfrc_passive
+    # Forces (nv,) that balance gravity and springs in the reference pose, in which the data begin.
+    balancing_forces = data.qfrc_bias - data.qfrc_passive
     scales = compute_joint_scales(robot)
     holding, forces = {}, {}
     for number, joint in enumerate(joints):
-        holding[joint.name] = float(bias[joint.velocity])
+        holding[joint.name] = float(balancing_forces[joint.velocity])
         amplitude = _choose_amplitude(joint, float(model.qpos0[joint.position]))
-        # The inertia force of a free joint at the centre frequency; gravity restrains other joints.
+        # The inertia force of a free joint at the centre frequency; gravity restrains other joints,
+        # which need a share of their typical force.
         inertia_force = scales.inertia[number] * CENTRE_FREQUENCY**2 * amplitude
         forces[joint.name] = float(
             max(inertia_force, MIN_GRAVITY_FORCE_SHARE * scales.force[number])
@@ -192,14 +194,14 @@ def _make_command(
     model = robot.compiled
     start = float(model.qpos0[joint.position])
     amplitude = _choose_amplitude(joint, start)
-    # Centre and amplitude without limits.
+    # Centre and amplitude without limits, in the unit of the control.
     if actuator.kind in ("position", "pid"):
         centre, command_amplitude = start, amplitude
     elif actuator.kind == "velocity":
         centre, command_amplitude = 0.0, CENTRE_FREQUENCY * amplitude
     else:
         gain = float(model.actuator_gear[actuator.id, 0] * model.actuator_gainprm[actuator.id, 0])
-        gain = gain or 1.0
+        gain = gain or 1.0  # Without a gain the control has no force, whatever it is.
         centre, command_amplitude = holding / gain, force / abs(gain)
     # Limits.
     if actuator.range is not None:

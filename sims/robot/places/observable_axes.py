@@ -40,17 +40,18 @@ def observable_axes(robot: RobotModel, body: str) -> tuple[int, ...]:
     data = make_reference_data(model)
     hinge_axes = []  # unit vectors in the world, of the hinges between the body and the world
     ancestor = number
-    while ancestor:
+    while ancestor:  # until the world, body 0
         first, count = model.body_jntadr[ancestor], model.body_jntnum[ancestor]
         for joint in range(first, first + count):
             kind = int(model.jnt_type[joint])
             if kind == hinge:
                 hinge_axes.append(data.xaxis[joint])
-            elif kind != slide:
+            elif kind != slide:  # a free or a ball joint
                 return (0, 1, 2)
         ancestor = int(model.body_parentid[ancestor])
     if not hinge_axes:
         return ()
+    # All hinges are parallel if they are parallel to the first one.
     direction = hinge_axes[0]
     if any(abs(float(axis @ direction)) < MIN_PARALLEL_COSINE for axis in hinge_axes):
         return (0, 1, 2)
@@ -104,6 +105,7 @@ def observable_tilts(robot: RobotModel, name: str) -> tuple[int, ...]:
     model = copy.copy(robot.compiled)
     joint = robot.joint(name)
     file_axis = model.jnt_axis[joint.id].copy()
+    # Rounded, so that rounding errors do not decide between equal components.
     nearest_axis = int(np.argmax(np.abs(file_axis).round(9)))
     observable = []
     for axis in (axis for axis in range(3) if axis != nearest_axis):
@@ -143,10 +145,12 @@ def _compute_random_state_forces(model: Any, joints: tuple[Joint, ...]) -> Array
             if joint.has_one_coordinate:
                 data.qpos[joint.position] += rng.uniform(-1.0, 1.0)
         data.qvel[:] = rng.uniform(-1.0, 1.0, model.nv)
+        # Positions, the inertia matrix, and velocities of the bodies.
         for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM):
             compute(model, data)
         mujoco.mj_comVel(model, data)
         mujoco.mj_fullM(model, data, inertia)
+        # The recursive Newton-Euler algorithm without accelerations gives the bias forces.
         bias = np.zeros(model.nv)
         mujoco.mj_rne(model, data, 0, bias)
         biases_and_inertias += [bias, inertia.ravel().copy()]

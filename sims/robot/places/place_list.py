@@ -125,13 +125,18 @@ def list_places(
 
 
 def _list_joint_places(robot: RobotModel) -> list[EffectPlace]:
-    """List the joints with one coordinate, in the order of the coordinates."""
+    """List the places of the joints with one coordinate, in the order of the coordinates.
+
+    A place has the unit, the typical force and inertia of its joint, what the model file states
+    there, and what kinds of effects it may have.
+    """
     from sims.robot.dynamics.joint_scales import coefficient_scales
 
     scales = coefficient_scales(robot)
+    # Joints whose drives may also drive the preceding joint.
     may_be_coupled = list_coupling_places(robot)
     bodies = robot.compiled.jnt_bodyid
-    # Later joints of a body replace earlier ones.
+    # Later joints of a body replace earlier ones in the dict.
     last_joint_of_body = {int(body): joint_id for joint_id, body in enumerate(bodies)}
     return [
         EffectPlace(
@@ -168,6 +173,7 @@ def _list_actuator_places(robot: RobotModel, joints: Sequence[EffectPlace]) -> l
     joints_by_name = {place.name: place for place in joints}
     places = []
     for actuator in robot.actuators:
+        # The place of its joint, or a similar one for a tendon or a site.
         driven_place = joints_by_name.get(actuator.joint or "")
         driven_place = driven_place or _make_actuator_place(actuator, joints, mass)
         if driven_place is None:
@@ -194,10 +200,11 @@ def _list_body_places(robot: RobotModel) -> list[EffectPlace]:
     robot's longest link. Along axes in which offsets cannot be observed, both ends are zero.
     """
     mass = _compute_moving_mass(robot)
+    # The length of a link is the distance of its body from the parent body. Body 0 is the world.
     longest_link = float(np.linalg.norm(robot.compiled.body_pos[1:], axis=1).max(initial=0.0))
     places = []
     for body in robot.bodies:
-        link_box = compute_centre_of_mass_limits(robot, body.name)
+        link_box = compute_centre_of_mass_limits(robot, body.name)  # (3, 2) lowest and highest
         box_centre = link_box.mean(axis=1)
         payload_reach = max(float(np.ptp(link_box, axis=1).max()), 0.5 * longest_link)
         payload_box = np.stack([box_centre - payload_reach, box_centre + payload_reach], axis=1)
@@ -208,6 +215,7 @@ def _list_body_places(robot: RobotModel) -> list[EffectPlace]:
             limits[effect] = {
                 axis: (low, high) for axis, (low, high) in zip("xyz", ends, strict=True)
             }
+        # Kind, size and inertia, which belong to a coordinate, do not matter to effects at bodies.
         places.append(
             EffectPlace(
                 name=body.name,
@@ -261,7 +269,8 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
     """Return the contact of two geoms as a place at which effects can act.
 
     It has the friction that the model file states, and how much stiffer the contact may become: its
-    time constant is reduced by at most `MAX_REDUCTION`, and not below MuJoCo's minimum.
+    time constant is reduced by at most `MAX_REDUCTION`, and not below MuJoCo's minimum. The limit
+    is the lowest relative change of the time constant, such as -0.99.
 
     Args:
         robot: model of the robot.
@@ -277,11 +286,11 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
     options = robot.compiled.opt
     time_constant = float(solref[0])  # negative if `solref` is a stiffness and a damping
     min_softness_change = -MAX_REDUCTION
-    if not options.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE and time_constant > 0:
-        # MuJoCo uses no smaller time constant than two time steps.
-        min_softness_change = max(
-            min_softness_change, min(2.0 * options.timestep / time_constant - 1.0, 0.0)
-        )
+    has_minimum = not options.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
+    if has_minimum and time_constant > 0:
+        # MuJoCo uses no smaller time constant than two time steps, by default.
+        change_to_minimum = 2.0 * options.timestep / time_constant - 1.0
+        min_softness_change = max(min_softness_change, min(change_to_minimum, 0.0))
     names = [get_geom_name(robot.compiled, geom) for geom in find_pair_geoms(robot, pair)]
     return EffectPlace(
         name=pair,

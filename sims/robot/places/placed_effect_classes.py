@@ -112,9 +112,12 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
         effect: registered effect.
         effect_place: place, with what the model file states there.
     """
+    # Coefficients. Those of a joint's axis are tilts about x, y and z, of which only some can be
+    # observed.
     tilts = effect_place.tilts if effect.name == "joint.axis" else None
     observable_coefficients = [c for c in effect.coefficients if tilts is None or c.name in tilts]
     coefficients = [_adapt_to_place(effect, c, effect_place) for c in observable_coefficients]
+    # Attributes and methods that differ from those of the registered effect.
     changed: dict[str, Any] = {"coordinate": effect_place.coordinate, "signal": effect_place.signal}
     changed["says"] = f"{effect.says_at_place or effect.says} (at {effect_place.words})"
     changed["pairs"] = effect_place.pairs
@@ -136,12 +139,12 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
         contained_names = [
             f"{contained_effect}@{effect_place.name}" for contained_effect in effect.contains
         ]
-        drive = f"inertia.armature@{effect_place.name}"
+        armature_effect = f"inertia.armature@{effect_place.name}"
         for number, c in enumerate(coefficients):
-            if c.of == "rotor":
-                contained_names.append(drive)
+            if c.of == "rotor":  # the rotor's share of the joint's inertia
+                contained_names.append(armature_effect)
                 changed["taking"] = _make_taking_method(
-                    drive, effect_place.inertia, number, c.plausible[0]
+                    armature_effect, effect_place.inertia, number, c.plausible[0]
                 )
         changed["contains"] = tuple(contained_names)
     return _create_placed_effect(
@@ -186,7 +189,8 @@ def make_shared_effects(
     kinds = {drive.kind for drive in drives}
     if len(joints) < 2 or len(kinds) > 1 or not issubclass(effect, Force):
         return
-    # Its coefficients have the units of a drive, and the sum of the typical forces.
+    # Its coefficients have the units of a drive, and the sum of the typical forces. The drives are
+    # of one kind, so that the first one stands for all.
     combined_place = drives[0]._replace(size=sum(drive.size for drive in joints.values()))
     coefficients = [_adapt_to_place(effect, c, combined_place) for c in effect.coefficients]
     changed: dict[str, Any] = {
@@ -211,8 +215,9 @@ def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., A
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
         """Compute the forces (L, D) along all driven joints from the total load of the supply."""
         robot = cast(RobotSnapshot, moment)
+        # Forces (L, D) of the drives, the first of both loads of the transmissions.
         drive_forces, _ = robot.carried
-        total_load = sum(np.abs(drive_forces[:, joint : joint + 1]) for joint in joints)
+        total_load = sum(np.abs(drive_forces[:, joint : joint + 1]) for joint in joints)  # (L, 1)
         forces = np.zeros_like(moment.x)
         for joint in joints:
             joint_snapshot = replace(robot.get_joint_snapshot(joint), shared=total_load)
@@ -254,15 +259,16 @@ def _is_rotor_inertia_stated(effect_place: EffectPlace, c: Coefficient) -> bool:
 
 
 def _make_taking_method(
-    drive: str, inertia: float, number: int, bounds: tuple[float, float]
+    armature_effect: str, inertia: float, number: int, bounds: tuple[float, float]
 ) -> Callable[[Effect, Array, str, Array], Array]:
     """Make the `taking` method, which starts a flexible joint at the values of a fitted armature.
 
-    A flexible joint may replace an armature effect. The fitted armature is then the inertia of its
-    rotor, from which its coefficient, the rotor's share of the joint inertia, follows.
+    A flexible joint may replace an armature effect, an added inertia of the rotor. The fitted
+    armature is then the inertia of the rotor of the flexible joint, from which its coefficient, the
+    rotor's share of the joint inertia, follows.
 
     Args:
-        drive: name of the armature effect, with its place.
+        armature_effect: name of the armature effect, with its place.
         inertia: inertia of the joint in kg m² or kg.
         number: index of the rotor's share among the coefficients of the flexible joint.
         bounds: lowest and highest value of the share.
@@ -270,7 +276,7 @@ def _make_taking_method(
 
     def taking(_: Effect, c: Array, simpler: str, armature: Array) -> Array:
         """Return coefficients c that include the effect `simpler`, if it is the armature effect."""
-        if simpler != drive:
+        if simpler != armature_effect:
             return c
         coefficients: Array = c.copy()
         coefficients[number] = np.clip(armature[0] / inertia, *bounds)
@@ -319,23 +325,23 @@ def make_effect_family(effect: type[Effect], members: Sequence[type[Effect]]) ->
         effect: registered effect.
         members: classes of the effect at each place, which is not empty.
     """
-    # 1. Coefficients.
-    shared = effect.name in SHARED_COEFFICIENT_EFFECTS
-    first = members[0].coefficients
-    coefficients: list[Coefficient] = list(first) if shared else []
-    if not shared:
+    # 1. Coefficients. All members have the same number of them.
+    is_shared = effect.name in SHARED_COEFFICIENT_EFFECTS
+    first_coefficients = members[0].coefficients
+    coefficients: list[Coefficient] = list(first_coefficients) if is_shared else []
+    if not is_shared:
         for member in members:
             for coefficient in member.coefficients:
                 coefficients.append(replace(coefficient, name=f"{coefficient.name}@{member.place}"))
-    count = len(first)
+    count = len(first_coefficients)
     instances = tuple(member() for member in members)
 
-    def parts(_: Effect, coefficient: Array) -> ActiveEffects:
-        """Return the effect at each place, with its share of the coefficients."""
-        if shared:
-            return tuple((member_effect, coefficient) for member_effect in instances)
+    def parts(_: Effect, c: Array) -> ActiveEffects:
+        """Return the effect at each place, with its rows of the coefficients c (K, L, 1)."""
+        if is_shared:
+            return tuple((member_effect, c) for member_effect in instances)
         return tuple(
-            (member_effect, coefficient[i * count : (i + 1) * count])
+            (member_effect, c[i * count : (i + 1) * count])
             for i, member_effect in enumerate(instances)
         )
 
@@ -379,18 +385,19 @@ def _create_placed_effect(
         if place
         else ()
     )
-    body = {
+    attributes = {
         "name": name,
         "of": effect.name,
         "place": place,
         "coefficients": tuple(coefficients),
         "contains": contains,
+        # A place at which the effect can act has all that it needs.
         "needs": "",
         "__module__": __name__,
         "__doc__": effect.__doc__,
         **changed,
     }
-    return type(f"{effect.__name__}At", (effect,), body)
+    return type(f"{effect.__name__}At", (effect,), attributes)
 
 
 def _unify_units(c: Coefficient) -> Coefficient:
@@ -423,7 +430,7 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
         unit = c.of.replace("error", "input").replace("input", effect_place.unit)
     elif c.of.startswith("reading"):
         unit = c.of.replace("reading", effect_place.unit)
-    # 2. Scale.
+    # 2. Scale. Forces are proportional to the typical force, and inverse forces to its inverse.
     if unit is None:
         unit = "1"
     force_ratio = effect_place.size / REFERENCE_FORCES[effect_place.kind]
@@ -432,8 +439,10 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     elif unit.startswith(("1/N", "1/(N")):
         low, high = low / force_ratio, high / force_ratio
     if effect.name == "inertia.armature":
+        # A gear multiplies the inertia of a rotor, which may exceed that of the links.
         high = 3.0 * effect_place.inertia
-    if c.of == "give":  # a compliance
+    if c.of == "give":
+        # A compliance, at most that with which the load swings at the lowest frequency.
         high = 1.0 / (effect_place.inertia * MIN_LOAD_FREQUENCY**2)
     # 3. Total.
     upper_limit = c.most
@@ -474,7 +483,7 @@ def make_effect_classes(
     Args:
         effect: registered effect.
         places: places of the robot by kind.
-        native: names of effects that the engine writes into the model.
+        native: names of effects that the engine writes into fields of MuJoCo's model.
         compiles: returns whether the model with an effect at one place compiles.
     """
     # Effects of the world have no places.
@@ -485,7 +494,9 @@ def make_effect_classes(
     if effect.name not in native and not _needs_no_engine_support(effect):
         return
     members = [
-        make_placed_effect(effect, s) for s in places[effect.at] if _acts_at(effect, s, places)
+        make_placed_effect(effect, place)
+        for place in places[effect.at]
+        if _acts_at(effect, place, places)
     ]
     members = [member for member in members if compiles(member)]
     yield from members
@@ -534,7 +545,7 @@ def _acts_at(
     is_driven = any(
         actuator.coordinate == effect_place.coordinate for actuator in places["actuator"]
     )
-    # Joints. The effect may not exist along a length, or along an angle.
+    # Joints. The effect may not exist along a length, or along an angle: its unit is None there.
     if effect.at == "joint" and first_coefficient.unit(_KINDS[effect_place.kind]) is None:
         return False
     if effect.at == "joint" and effect_place.is_base and effect.name not in BASE_EFFECTS:
@@ -542,7 +553,8 @@ def _acts_at(
     if effect.at == "joint" and effect.needs == "input":
         return is_driven
     if issubclass(effect, HiddenStateEffect) and effect.between:
-        # The effect connects the drive of a joint to its load, so both must exist.
+        # The effect connects the drive of a joint to its load, so both must exist. The second joint
+        # that it adds is the last one of the body.
         return effect_place.last and is_driven
     if effect.needs == "servo" and not effect_place.servo:
         return False
