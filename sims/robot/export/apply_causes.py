@@ -134,7 +134,7 @@ def apply_causes(
         InputError: the robot has no place of that name.
         RuntimeError: the model does not accept a change; this is a program error.
     """
-    # 1. Elements.
+    # 1. Elements. A family, one effect at all places, is expanded to its places.
     fitted_causes = expand_families(robot, causes)
     notes = []
     couplings = {
@@ -142,6 +142,7 @@ def apply_causes(
     }
     robot = make_coupled_robot(robot, couplings) if couplings else robot
     robot = add_contact_pairs(robot, [c.place for c in fitted_causes if _is_at_contact(c)])
+    # Springs and gaps between a drive and its links, by joint.
     series = _combine_series_elements(fitted_causes)
     if series:
         notes += [KEYFRAMES_OMITTED_NOTE] if robot.compiled.nkey else []
@@ -156,10 +157,9 @@ def apply_causes(
         values_before = {name: values.copy() for name, values in target_values.items()}
         places_in_series = {applied.place for applied in applied_causes if _is_in_series(applied)}
         # The elements in series at a place are written once, with the first of their causes.
+        unwritten_series = series if cause.place not in places_in_series else {}
         try:
-            remark = _write_cause(
-                target_values, robot, cause, series if cause.place not in places_in_series else {}
-            )
+            remark = _write_cause(target_values, robot, cause, unwritten_series)
         except UnstatableCauseError as reason:
             notes.append(f"{cause.format(recording)}: not in the file: {reason}")
             continue
@@ -218,7 +218,13 @@ def _is_in_series(cause: FittedCause) -> bool:
 def _combine_series_elements(causes: Sequence[FittedCause]) -> dict[str, SeriesElement]:
     """Combine the springs and gaps that causes put in series with a joint to one element by joint.
 
-    The numbers of an element have the shape (1,).
+    Such an element is between the drive of the joint and the links that it moves.
+
+    Args:
+        causes: fitted causes; those that add nothing in series are ignored.
+
+    Returns:
+        Elements by joint; their numbers have the shape (1,).
     """
     elements: dict[str, list[SeriesElement]] = {}
     for cause in (cause for cause in causes if _is_in_series(cause)):
@@ -234,7 +240,7 @@ def _write_cause(
     cause: FittedCause,
     series: Mapping[str, SeriesElement],
 ) -> str | None:
-    """Write a cause into the fields of the model, which a model file shall have.
+    """Write a cause into the fields (numbers) of the compiled model that a model file shall have.
 
     Args:
         target_values: fields of the model, changed in place.
@@ -315,7 +321,7 @@ def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any
         statements = find_missing_statements(model, target_values, tolerance)
         if not statements:
             return spec, model
-        # 2. Changes.
+        # 2. Changes. The kind "body" means the mass and inertia of a body.
         for statement in statements:
             set_attributes(elements[statement.element], statement)
         if any(statement.element.kind == "body" for statement in statements):
@@ -347,7 +353,8 @@ def _keep_masses(spec: Any, target_values: Fields) -> None:
 def _index_spec_elements(spec: Any) -> dict[ModelElement, Any]:
     """Return the elements of an editable model (`mujoco.MjSpec`) by kind and compiled number.
 
-    A body is there twice: as ``body`` for its inertial, and as ``frame`` for its pose.
+    A body is there twice: as ``body`` for its inertial, and as ``frame`` for its pose. The options
+    of the model are the element ``option`` with the number 0.
     """
     # Elements have numbers only after compilation.
     spec.compile()
@@ -421,10 +428,11 @@ def _convert_to_inner_frame(body: Any, position: Sequence[float]) -> Array:
     # Importing scipy.spatial takes 0.1 s, and most model files have no fused bodies.
     from scipy.spatial.transform import Rotation
 
+    # Pose of the innermost frame in the frame reached so far, at last in the parent body.
     rotation, origin = Rotation.identity(), np.zeros(3)
     frame = body.frame
     while frame is not None:
-        w, *xyz = frame.quat
+        w, *xyz = frame.quat  # SciPy expects the real part last
         outer = Rotation.from_quat([*xyz, w])
         rotation, origin = outer * rotation, frame.pos + outer.apply(origin)
         frame = frame.frame

@@ -92,25 +92,32 @@ def _format_default_element(
         for name, value in values.items()
         if name not in _POSE_ATTRIBUTES and value != _MUJOCO_DEFAULTS.get(name, (0.0,) * len(value))
     }
+    # A joint; the names of the solver parameters of friction begin with "sol".
     if element.kind == "joint":
         if not values["frictionloss"][0]:
             class_values = {
                 name: value for name, value in class_values.items() if not name.startswith("sol")
             }
         return "joint", format_attributes(class_values)
-    ranges = {"ctrlrange": "ctrllimited", "forcerange": "forcelimited"}
+    # An actuator; each range has a flag that tells whether it limits.
+    flag_of_range = {"ctrlrange": "ctrllimited", "forcerange": "forcelimited"}
     class_values = {
-        k: v for k, v in class_values.items() if k not in ranges or values[ranges[k]][0]
+        name: value
+        for name, value in class_values.items()
+        if name not in flag_of_range or values[flag_of_range[name]][0]
     }
     if not _is_servo(values):
-        return "general", format_attributes(
-            {**class_values, **{k: values[k] for k in ("gaintype", "biastype")}}
-        )
+        types = {name: values[name] for name in ("gaintype", "biastype")}
+        return "general", format_attributes(class_values | types)
     (stiffness, *_), (_, _, negative_damping, *_) = values["gainprm"], values["biasprm"]
     gains = {"kp": format_number(stiffness), "kv": format_number(-negative_damping)}
-    return "position", gains | format_attributes(
-        {k: v for k, v in class_values.items() if not k.startswith(("gain", "bias", "dyn"))}
-    )
+    # The element ``position`` implies all attributes of gain, bias and dynamics.
+    others = {
+        name: value
+        for name, value in class_values.items()
+        if not name.startswith(("gain", "bias", "dyn"))
+    }
+    return "position", gains | format_attributes(others)
 
 
 def _is_servo(values: Mapping[str, Values]) -> bool:
@@ -146,18 +153,20 @@ def render_model_using_class(
     Raises:
         NotEditableError: the rendered file differs from the modified model; states the field.
     """
-    # 1. Elements.
+    # 1. Elements of the text: attributes to set (`new`), to remove, and another element name.
     document = MjcfDocument(applied.text.encode(), robot.path)
     tags = document.map_to_compiled_ids(applied.model)
-    tag = tags[ModelElement("joint", joint)]
-    tag.new["class"] = name
-    tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["joint"]} - _POSE_ATTRIBUTES
+    joint_tag = tags[ModelElement("joint", joint)]
+    joint_tag.new["class"] = name
+    joint_tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["joint"]} - _POSE_ATTRIBUTES
     if actuator is not None:
         element = ModelElement("actuator", actuator)
-        tag = tags[element]
-        tag.new["class"] = name
-        tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["actuator"]} | set(SHORTCUT_ATTRIBUTES)
-        tag.renamed, _ = _format_default_element(
+        actuator_tag = tags[element]
+        actuator_tag.new["class"] = name
+        actuator_tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["actuator"]}
+        actuator_tag.removed |= set(SHORTCUT_ATTRIBUTES)
+        # The element gets the name that it has in the class.
+        actuator_tag.renamed, _ = _format_default_element(
             element, list_all_attributes(applied.model, element, applied.target_values)
         )
     # 2. Folders.

@@ -44,6 +44,7 @@ class _Actuator:
         import mujoco
 
         self.id = robot.actuator(place).id
+        # Address of its first control.
         self.control = int(robot.compiled.actuator_ctrladr[self.id])
         # Whether there is one control.
         self.single = int(robot.compiled.actuator_ctrlnum[self.id]) == 1
@@ -58,7 +59,9 @@ class _Actuator:
         )
         self.gain = fields["actuator_gainprm"][0, self.id]
         self.bias = fields["actuator_biasprm"][0, self.id]
-        # The factor 1 + a and the offset b of (1) from causes that are in the fields already.
+        # The factor 1 + a and the offset b of the input (1 + a) u + b for the command u, from
+        # causes that are in the fields already. MuJoCo has no such field; it is added here for all
+        # actuators, without any cause at first.
         unchanged = np.array([[(1.0, 0.0)] * len(robot.compiled.actuator_ctrlnum)])
         self.command = fields.setdefault("command", unchanged)[0, self.id]
 
@@ -124,9 +127,9 @@ _NOT_LINEAR = "its actuator is not a gain and a bias of one control"
 def _write_input_gain(actuator: _Actuator, a: float) -> None:
     """Write an error a of the input gain into the actuator.
 
-    The actuator's gain is multiplied by 1 + a (1). Its control range is divided by the same factor,
+    The actuator's gain is multiplied by 1 + a. Its control range is divided by the same factor,
     since MuJoCo's range limits the command before the gain, but in reality it does so after the
-    gain (2).
+    gain.
 
     Args:
         actuator: actuator whose fields are changed.
@@ -142,8 +145,9 @@ def _write_input_gain(actuator: _Actuator, a: float) -> None:
     if 1.0 + a < MIN_GAIN_FACTOR:
         raise UnstatableCauseError("a control range cannot express a factor of zero or less")
     low, high = actuator.limits()
-    actuator.limit(low / (1.0 + a), high / (1.0 + a))  # (2)
-    actuator.gain[0] *= 1.0 + a  # (1)
+    actuator.limit(low / (1.0 + a), high / (1.0 + a))
+    actuator.gain[0] *= 1.0 + a
+    # The factor of the command, for causes that are written later.
     actuator.command[0] *= 1.0 + a
 
 
@@ -151,8 +155,8 @@ def _write_input_bias(actuator: _Actuator, b: float) -> None:
     """Write an input bias b into the actuator: a constant force, and a shifted control range.
 
     With the command u and an input gain 1 + a that is in the fields already, the input is
-    (1 + a) u + b. So the actuator with gain g gets the additional force g b (1), and the limits of
-    its control are shifted by -b / (1 + a) (2). The gain in the fields is g (1 + a).
+    (1 + a) u + b. So the actuator with gain g gets the additional force g b, and the limits of its
+    control are shifted by -b / (1 + a). The gain in the fields is g (1 + a).
 
     Args:
         actuator: actuator whose fields are changed.
@@ -165,8 +169,9 @@ def _write_input_bias(actuator: _Actuator, b: float) -> None:
         raise UnstatableCauseError(_NOT_LINEAR)
     input_factor, _ = actuator.command  # 1 + a
     low, high = actuator.limits()
-    actuator.limit(low - b / input_factor, high - b / input_factor)  # (2)
-    actuator.shift(float(actuator.gain[0] / input_factor * b))  # (1)
+    actuator.limit(low - b / input_factor, high - b / input_factor)
+    actuator.shift(float(actuator.gain[0] / input_factor * b))
+    # The offset of the command, for causes that are written later.
     actuator.command[1] += b
 
 
@@ -280,25 +285,29 @@ def _write_constant_force(fields: Fields, robot: RobotModel, cause: FittedCause)
     Raises:
         UnstatableCauseError: the joint has neither a linear spring nor an actuator without limits.
     """
-    # 1. Spring.
+    # 1. Spring. Its rest position also determines the rest length of tendons, except for those of
+    # coupled drives, which have no springs.
     joint, (force,) = robot.joint(cause.place), cause.coefficients
     stiffness = fields["jnt_stiffness"][0, joint.id]
-    tendon_count = robot.compiled.ntendon - len(robot.coupled)
-    has_linear_spring = not fields["jnt_stiffnesspoly"][0, joint.id].any() and not tendon_count
+    has_tendons = robot.compiled.ntendon > len(robot.coupled)
+    is_linear = not fields["jnt_stiffnesspoly"][0, joint.id].any()
     if (
         joint.has_one_coordinate
         and stiffness > 0
-        and has_linear_spring
+        and is_linear
+        and not has_tendons
         and not robot.compiled.jnt_springyield[joint.id]
     ):
         fields["qpos_spring"][0, joint.position] += force / stiffness
         return None
-    # 2. Actuator.
+    # 2. Actuator. That of a coupled drive acts on two joints. Limits may be those of the file, of
+    # the joint, or of another cause, which is in the fields.
     for driving in robot.actuators:
         actuator = _Actuator(fields, robot, driving.name)
         is_uncoupled = joint.name not in robot.coupled
-        is_unlimited = driving.force is None and joint.effort is None and is_uncoupled
-        if driving.joint == joint.name and actuator.single and actuator.steady and is_unlimited:
+        is_unlimited = driving.force is None and joint.effort is None
+        can_have_bias = actuator.single and actuator.steady
+        if driving.joint == joint.name and can_have_bias and is_unlimited and is_uncoupled:
             gear = robot.compiled.actuator_gear[actuator.id]
             if not fields["actuator_forcelimited"][0, actuator.id] and gear[0]:
                 actuator.shift(float(force / gear[0]))

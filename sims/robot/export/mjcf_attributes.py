@@ -67,16 +67,18 @@ def _get_element_values(model: Any, element: ModelElement, name: str, values: An
         name: name of the field.
         values: values of the field.
     """
-    # Fields of the model with the row of an element.
-    row_fields = {
+    if name.startswith("opt."):
+        return values
+    # Fields with the address of an element's first row, by the beginning of the name of a field.
+    address_fields = {
         "dof_": "jnt_dofadr",
         "qpos": "jnt_qposadr",
         "actuator_ctrl": "actuator_ctrladr",
     }
-    if name.startswith("opt."):
-        return values
-    row_field = next((row for start, row in row_fields.items() if name.startswith(start)), None)
-    return values[element.id if row_field is None else getattr(model, row_field)[element.id]]
+    for beginning, address_field in address_fields.items():
+        if name.startswith(beginning):
+            return values[getattr(model, address_field)[element.id]]
+    return values[element.id]
 
 
 class MjcfAttribute(NamedTuple):
@@ -102,6 +104,7 @@ class MjcfAttribute(NamedTuple):
             model: compiled model, which tells the row of the element in each field.
             element: the element.
         """
+        # Fields have one batch element, 0.
         parts = [
             np.ravel(_get_element_values(model, element, name, fields[name][0]))
             for name in self.fields
@@ -212,6 +215,7 @@ def list_elements(model: Any) -> list[ModelElement]:
         for i in range(model.njnt)
         if int(model.jnt_type[i]) in scalar_types
     ]
+    # Inertials and positions of the bodies. Body 0 is the world.
     elements += [ModelElement("body", i) for i in range(1, model.nbody)]
     elements += [ModelElement("frame", i) for i in range(1, model.nbody)]
     scalar_actuators = [

@@ -109,10 +109,11 @@ class MjcfDocument:
         tags_by_element = {ModelElement("body", i): tag for i, tag in enumerate(bodies, start=1)}
         tags_by_element |= {ModelElement("joint", i): tag for i, tag in enumerate(joints)}
         tags_by_element |= {ModelElement("actuator", i): tag for i, tag in enumerate(actuators)}
+        # The world counts as a body of the model.
         _check_elements_match_model(
             tags_by_element, model, (len(bodies) + 1, len(joints), len(actuators))
         )
-        # By name.
+        # By name. A pair is known by the names of its two geoms, in any order.
         pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         pair_ids = {
             frozenset(str(model.geom(geom).name) for geom in geoms): i
@@ -239,7 +240,7 @@ class MjcfDocument:
         """
         for tag in root.walk():
             inner = self._included.get(tag)
-            if inner is None:
+            if inner is None:  # not an include element
                 continue
             self._prepare_includes(inner.root)
             name = tag.attributes["file"]

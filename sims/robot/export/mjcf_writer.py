@@ -68,6 +68,7 @@ class MjcfWriter:
             target_values: fields of the model that it should compile to.
         """
         self.document, self.model, self.wanted = document, model, target_values
+        # Elements of the text by their kind and number in the compiled model.
         self.tags = document.map_to_compiled_ids(model)
         self.degrees = True
         for compiler in document.find_elements("compiler"):
@@ -77,7 +78,8 @@ class MjcfWriter:
         """Write the attributes of one element into the document, and comments before the element.
 
         How depends on the kind of the element: options and inertials may have to be created, and
-        actuators may need another element name.
+        actuators may need another element name. The kind ``body`` means the inertial of a body, and
+        ``frame`` its position.
 
         Args:
             statement: element with the attributes that change; without any, only comments are
@@ -95,6 +97,7 @@ class MjcfWriter:
             _add_comments(body, comments)
             body.new |= format_attributes(statement.values)
         elif element.kind == "body":
+            # Without changed values there are only comments.
             if statement.values:
                 self._keep_masses()
             self._write_inertial(self.tags[element], statement, comments)
@@ -118,23 +121,27 @@ class MjcfWriter:
 
         Args:
             statement: values of the options.
-            comments: comments to write before the element.
+            comments: comments to write before the element. They are left out if there is neither an
+                option element nor a value.
         """
         options, values = self.document.find_elements("option"), format_attributes(statement.values)
         if options:
             _add_comments(options[-1], comments)
             options[-1].new |= values
-            return
-        if not values:
-            return
-        self.document.root.insert_within(format_element("option", values), comments)
+        elif values:
+            self.document.root.insert_within(format_element("option", values), comments)
 
     def _keep_masses(self) -> None:
-        """Change compiler settings so that MuJoCo uses inertials as specified."""
+        """Change compiler settings so that MuJoCo uses inertials as specified.
+
+        Two settings of a file would override them: one computes masses from geoms, the other scales
+        all masses to a total.
+        """
         for compiler in self.document.find_elements("compiler"):
             if compiler.get_attribute("inertiafromgeom") == "true":
                 compiler.new["inertiafromgeom"] = "auto"
             if float(compiler.get_attribute("settotalmass") or -1) > 0:
+                # The total with the changed masses.
                 compiler.new["settotalmass"] = format_number(float(self.wanted["body_mass"].sum()))
 
     def _write_inertial(
@@ -143,8 +150,8 @@ class MjcfWriter:
         """Write mass, centre of mass and inertia into the (perhaps new) inertial of a body.
 
         Only attributes whose value changes are written, or all of them if the statement insists on
-        it. Other forms of the inertial's orientation are removed, because new principal moments
-        come with their own quaternion.
+        it, since the changed ones alone had no effect. Other forms of the inertial's orientation
+        are removed, because new principal moments come with their own quaternion.
 
         Args:
             body: element of the body.
@@ -160,16 +167,16 @@ class MjcfWriter:
         else:
             inertial = inertials[0]
             _add_comments(inertial, comments)
-            before = self._list_attributes_before(statement.element)
-            changed = {
+            values_before = self._list_attributes_before(statement.element)
+            changed_names = {
                 name
                 for name, target in statement.values.items()
-                if statement.insisted or target != before[name]
+                if statement.insisted or target != values_before[name]
             }
-            if "diaginertia" in changed:
-                changed |= {"quat"}
+            if "diaginertia" in changed_names:  # principal moments
+                changed_names |= {"quat"}
                 inertial.removed |= set(_ORIENTATION_ATTRIBUTES)
-            inertial.new |= {name: values[name] for name in values if name in changed}
+            inertial.new |= {name: values[name] for name in values if name in changed_names}
 
     def _list_attributes_before(self, element: ModelElement) -> Mapping[str, Values]:
         return list_all_attributes(self.model, element, copy_model_fields(self.model))
@@ -186,8 +193,9 @@ class MjcfWriter:
         """
         values = format_attributes(statement.values)
         is_in_degrees = self.degrees and tag.get_attribute("type") in (None, "hinge")
-        for name in ANGLE_ATTRIBUTES & set(statement.values) if is_in_degrees else ():
-            values[name] = format_number(float(np.rad2deg(statement.values[name][0])))
+        if is_in_degrees:
+            for name in ANGLE_ATTRIBUTES & set(statement.values):
+                values[name] = format_number(float(np.rad2deg(statement.values[name][0])))
         if {"damping", "stiffness"} & set(values) and tag.get_attribute("springdamper"):
             values["springdamper"] = "0 0"
         return values
@@ -206,29 +214,24 @@ class MjcfWriter:
             statement: attribute values to write.
         """
         changed = statement.values
+        target_attributes = list_all_attributes(self.model, statement.element, self.wanted)
+        # A statement that is insisted on is written completely, as if nothing was stated.
         before = {} if statement.insisted else self._list_attributes_before(statement.element)
-        # 1. The shortcut is kept.
-        gains = _format_shortcut(
-            tag.name,
-            list_all_attributes(self.model, statement.element, self.wanted),
-            changed,
-            before,
-        )
+        # 1. The shortcut is kept, with its own attributes for the gains.
+        gains = _format_shortcut(tag.name, target_attributes, changed, before)
         if gains is not None:
             if "kv" in gains:
-                tag.removed.add("dampratio")
-            return (
-                format_attributes({k: v for k, v in changed.items() if k not in _GAIN_ATTRIBUTES})
-                | gains
-            )
+                tag.removed.add("dampratio")  # an alternative to kv
+            others = {k: v for k, v in changed.items() if k not in _GAIN_ATTRIBUTES}
+            return format_attributes(others) | gains
         # 2. The element becomes ``general``, or is already.
         if tag.name != "general":
             tag.renamed = "general"
             tag.removed |= set(SHORTCUT_ATTRIBUTES)
-            target_attributes = list_all_attributes(self.model, statement.element, self.wanted)
             changed = {
                 k: v for k, v in target_attributes.items() if k in changed or _is_needed(k, v)
             }
+            # Since MuJoCo 4, an attribute states what the control of a servo is.
             if tag.name in _INPUT_BY_SHORTCUT and hasattr(self.model, "actuator_ctrlspec"):
                 tag.new["input"] = _INPUT_BY_SHORTCUT[tag.name]
         return format_attributes(changed)
@@ -302,6 +305,7 @@ def _format_values(name: str, values: tuple[float, ...]) -> str:
         name: name of the attribute.
         values: its numbers, as in the compiled model.
     """
+    # ``interp``, a kind of interpolation, is a word in a file but a plain integer in a spec.
     if name in ENUM_ATTRIBUTES or name == "interp":
         return get_enum_word(name, values[0])
     if name in FLAG_ATTRIBUTES:
@@ -385,11 +389,12 @@ def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
     if not robot.series and not robot.coupled and not has_fixed_base and not robot.spec.pairs:
         return text
     document = MjcfDocument(text, robot.path)
-    # 1. As by `parsing.floating_bases.fix_bases`.
-    for tag in document.walk() if has_fixed_base else ():
-        is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
-        if tag.name in ("freejoint", "keyframe") or is_free:
-            tag.text = b""
+    # 1. As by `parsing.floating_bases.fix_bases`. An element with an empty text is left out.
+    if has_fixed_base:
+        for tag in document.walk():
+            is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
+            if tag.name in ("freejoint", "keyframe") or is_free:
+                tag.text = b""
     # 2. Tendons.
     if robot.coupled:
         _write_couplings(document, robot, model)
@@ -398,6 +403,7 @@ def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
     # 4. Joints in series, each after the joint of its drive.
     tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
     for series_joint in (joint for joint in robot.spec.joints if joint.name in robot.series):
+        # Its name is that of the drive's joint and an ending.
         drive_joint, _, _ = series_joint.name.rpartition("_")
         joint_tag = tags.get(drive_joint)
         if joint_tag is None:
@@ -420,19 +426,21 @@ def _write_couplings(document: MjcfDocument, robot: RobotModel, model: Any) -> N
     Raises:
         NotEditableError: the text lacks a joint or an actuator of the compiled model.
     """
+    # Elements of the actuators, in the order of their numbers.
     tags = [child for tag in document.find_elements("actuator") for child in document.children(tag)]
     if len(tags) != len(robot.actuators):
         raise NotEditableError("the compiled model has other actuators")
+    joint_names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
     for name in robot.coupled:
         first = find_preceding_joint(robot, name)
-        assert first is not None
-        joint_names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
+        assert first is not None  # only joints with a preceding one can be coupled
         if not {name, first.name} <= joint_names:
             raise NotEditableError(f"no joint of its text is called {name} or {first.name}")
         c = format_number(float(model.wrap_prm[get_coupling_address(robot, name)]))
         joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
         tendon = f'<fixed name="{name}{COUPLING_TENDON_SUFFIX}">{joints}</fixed>'
         document.root.insert_within(f"<tendon>{tendon}</tendon>")
+        # The actuators of the joint get the tendon as their target.
         for actuator in (a for a in robot.actuators if a.joint == name):
             tags[actuator.id].removed |= {"joint", "jointinparent"}
             tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"

@@ -54,6 +54,7 @@ def _fields_differ(first: Any, second: Any, tolerance: float) -> bool:
     if first.dtype.kind != "f":
         return bool((first != second).any())
     scale = max(float(np.abs(first).max(initial=0.0)), float(np.abs(second).max(initial=0.0)))
+    # The difference of two infinities is NaN, and close to nothing; they are compared directly.
     is_close = np.abs(first - second) <= tolerance * scale
     return not bool((is_close | (first == second)).all())
 

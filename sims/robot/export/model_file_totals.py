@@ -158,7 +158,8 @@ def _read_numbers(fields: Fields, robot: RobotModel, effect: type[Effect]) -> Se
     name, place = _get_effect_name(effect), effect.place
     if name in _READERS:
         return _READERS[name](fields, robot, place)
-    # The largest of three principal moments represents a tensor. Fields have one batch element, 0.
+    # Each coefficient has a main field, and others that hold the same number. The largest of three
+    # principal moments represents a tensor. Fields have one batch element, 0.
     return [
         main_field.sign * np.max(fields[main_field.name][(0, *main_field.address)])
         for main_field, *_ in model_fields(robot, name, place)

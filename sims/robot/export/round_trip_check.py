@@ -55,10 +55,12 @@ def check_written_files(
 ) -> None:
     """Reload each written file from a temporary folder, and compare it with the intended model.
 
+    A program error in the writers is detected in this way before the user gets a wrong file.
+
     Args:
         robot: robot as read from its model file.
         causes: causes that were written.
-        written_files: the written files.
+        written_files: the written files: an MJCF, a URDF, or both.
 
     Raises:
         RuntimeError: a number or the motion differs; names the field. This is a program error.
@@ -122,13 +124,13 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
         for m in (reloaded_model, target_model)
     )
     tensor_tolerance = max(MOTION_TOLERANCE * np.abs(target_tensors).max(), MIN_MOMENT)
-    for name, reloaded_values, target_values, tolerance in (
-        *(
-            (name, getattr(reloaded_model, name), getattr(target_model, name), 0.0)
-            for name in _URDF_FIELDS
-        ),
-        ("body_inertia", reloaded_tensors, target_tensors, tensor_tolerance),
-    ):
+    # Name of the field, values in the written and in the intended model, and tolerance.
+    comparisons = [
+        (name, getattr(reloaded_model, name), getattr(target_model, name), 0.0)
+        for name in _URDF_FIELDS
+    ]
+    comparisons.append(("body_inertia", reloaded_tensors, target_tensors, tensor_tolerance))
+    for name, reloaded_values, target_values, tolerance in comparisons:
         if reloaded_values.shape != target_values.shape or not np.allclose(
             reloaded_values,
             target_values,
@@ -136,7 +138,8 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
             atol=max(tolerance, EQUAL_NUMBERS_TOLERANCE),
         ):
             raise RuntimeError(f"extended.urdf differs from the intended model: {name}")
-    # 4. Motion. Colliding shapes may be meshes in other folders.
+    # 4. Motion. Colliding shapes may be meshes in other folders. Fields that a URDF cannot state
+    # become equal, so that only differences count that it can state.
     for model in (target_model, reloaded_model):
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         for name in _UNCOMPARED_FIELDS:

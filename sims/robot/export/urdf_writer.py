@@ -103,11 +103,10 @@ class UrdfWriter:
         """
         joint = self._find_joint(cause)
         dynamics = _get_or_add_child(joint, "dynamics")
-        before = float(dynamics.get_attribute(attribute) or 0.0)
+        file_value = float(dynamics.get_attribute(attribute) or 0.0)
+        total = float(add_to_file_value(file_value, cause.coefficients[0]))  # at least zero
         self._add_comment(dynamics, cause)
-        dynamics.new[attribute] = format_number(
-            float(add_to_file_value(before, cause.coefficients[0]))
-        )
+        dynamics.new[attribute] = format_number(total)
 
     def _add_comment(self, tag: XmlElement, cause: FittedCause) -> None:
         tag.before.append(cause.format(self.recording))
@@ -142,7 +141,8 @@ class UrdfWriter:
             if inertial is not None:
                 inertials += [(name, inertial)] if _has_mass(inertial) else []
             elif link is None or _find_child(link, "collision"):
-                # The mass of the whole body is not stated.
+                # The mass of this link follows from its shapes, or the file does not have the link.
+                # So the mass of the whole body is not stated.
                 inertials = []
                 break
         if not inertials:
@@ -177,14 +177,16 @@ class UrdfWriter:
             attributes: names of the attributes by child element of an inertial, such as the value
                 of the mass; those that are not stated stay so.
         """
-        factor = float(compute_factor(cause.coefficients[0]))
+        factor = float(compute_factor(cause.coefficients[0]))  # 1 + c, more than zero
         for _, inertial in self._find_inertials(cause):
             self._add_comment(inertial, cause)
             for name, keys in attributes.items():
                 child = _find_child(inertial, name)
+                if child is None:
+                    continue
                 for key in keys:
-                    value = child.get_attribute(key) if child else None
-                    if child and value is not None:
+                    value = child.get_attribute(key)
+                    if value is not None:
                         child.new[key] = format_number(float(value) * factor)
 
     def _write_centre_of_mass(self, cause: FittedCause) -> None:
@@ -216,13 +218,14 @@ class UrdfWriter:
         (c,) = cause.coefficients
         self._add_comment(joint, cause)
         # The axis is stated in the frame of the joint, and the origin in that of the parent link.
+        # The columns of `axes` are the axes of the joint's frame in the parent link.
         axis = _get_joint_axis(joint)
         axes = _compute_rotation(_read_origin(joint, "rpy"))
         if joint.get_attribute("type") == "prismatic":
             _set_vector(joint, "origin", "xyz", _read_origin(joint, "xyz") - axes @ axis * c)
         else:
             rotated_frame = Rotation.from_matrix(axes) * Rotation.from_rotvec(-c * axis)
-            _set_vector(joint, "origin", "rpy", rotated_frame.as_euler("xyz"))  # (3)
+            _set_vector(joint, "origin", "rpy", rotated_frame.as_euler("xyz"))
 
     def _write_joint_axis(self, cause: FittedCause) -> None:
         """Rotate the axis of a joint by a rotation vector in radians, in the joint's frame."""
@@ -245,6 +248,7 @@ class UrdfWriter:
             UnstatableCauseError: no joint of the file carries the body.
         """
         body, model = self.robot.body(cause.place), self.robot.compiled
+        # A link of a URDF has at most one parent joint.
         joints = [tag for tag in self.joints.values() if _get_link_name(tag, "child") == body.name]
         if not joints:
             raise UnstatableCauseError("the file has no joint that carries the link")
@@ -285,6 +289,7 @@ class UrdfWriter:
         payload_position = self.robot.compiled.body_ipos[body.id] + offset
         centre = _read_origin(inertial, "xyz")
         axes = _compute_rotation(_read_origin(inertial, "rpy"))
+        # The attributes are in the order of the upper triangle.
         values = [float(tensor_tag.get_attribute(key) or 0.0) for key in _TENSOR_ATTRIBUTES]
         tensor = np.zeros((3, 3))
         tensor[np.triu_indices(3)] = values
@@ -306,9 +311,14 @@ class UrdfWriter:
         """Return the axes (3, 3) of a link in the frame of the body into which it is fused.
 
         The rotations of the fixed joints between them are multiplied.
+
+        Args:
+            link: name of the link.
+            body: name of the body, which is that of its first link.
         """
         axes = np.eye(3)
         while link != body:
+            # The joint that carries the link.
             (joint,) = [tag for tag in self.joints.values() if _get_link_name(tag, "child") == link]
             axes = _compute_rotation(_read_origin(joint, "rpy")) @ axes
             link = _get_link_name(joint, "parent")

@@ -128,19 +128,20 @@ def _render_urdf(
     except NotEditableError as unfit:
         notes.append(f"no URDF is written: {unfit}")
         return None
-    lines = []
+    urdf_notes = []
     fitted_causes = expand_families(robot, causes)
+    # Some causes, such as a payload, must follow others.
     for cause in sorted(fitted_causes, key=lambda entry: get_write_order(entry.effect)):
         try:
             writer.write(cause)
         except UnstatableCauseError as reason:
-            lines.append(f"{cause.format(recording)}: not in the URDF: {reason}")
+            urdf_notes.append(f"{cause.format(recording)}: not in the URDF: {reason}")
             continue
         if cause.effect == COULOMB and robot.friction_form == "stiff":
-            lines.append(_SOFT_FRICTION_URDF_NOTE)
-    lines = list(dict.fromkeys(lines))
-    notes += lines
-    return writer.to_text(lines)
+            urdf_notes.append(_SOFT_FRICTION_URDF_NOTE)
+    urdf_notes = list(dict.fromkeys(urdf_notes))  # without repetitions
+    notes += urdf_notes
+    return writer.to_text(urdf_notes)
 
 
 class MjcfEditor:
@@ -191,11 +192,11 @@ class MjcfEditor:
                 element_statement = statements.setdefault(
                     statement.element, AttributeStatement(statement.element)
                 )
-                # Attributes that were written without effect, or that another change has altered,
-                # need their related attributes.
-                element_statement.insisted = (
-                    bool(element_statement.values) or model is not self.original
-                )
+                # Attributes that were written without effect, or that another change has altered
+                # (in a round after the first), need their related attributes.
+                had_no_effect = bool(element_statement.values)
+                is_later_round = model is not self.original
+                element_statement.insisted = had_no_effect or is_later_round
                 element_statement.values |= statement.values
             # 2. New text.
             text = self._render_document(list(statements.values()))

@@ -125,6 +125,7 @@ class XmlText:
         """
         tag = XmlElement(name, attributes, self._parser.CurrentByteIndex)
         tag.inside = tag.end = self._end_of(tag.begin)
+        # Elements whose end tag has not been reached are open; the last one is the parent.
         if self._open:
             self._open[-1].children.append(tag)
         else:
@@ -205,7 +206,7 @@ class XmlText:
         """
         indent = self._get_indentation(tag.begin)
         comments = [self._render_comment(text) + self._newline + indent for text in tag.before]
-        if tag.text is not None:
+        if tag.text is not None:  # a text that replaces the element
             return b"".join([*comments, tag.text])
         if self._is_self_closing(tag) and (tag.within or tag.inserted):
             raise NotEditableError(f"{tag.name} has nothing in it")
@@ -254,7 +255,7 @@ class XmlText:
             tag: element with its new and removed attributes, and where it stands in the text.
         """
         text = self.text[tag.begin : tag.inside]
-        offset = 1 + len(tag.name.encode())
+        offset = 1 + len(tag.name.encode())  # after "<" and the name
         fragments = [b"<", (tag.renamed or tag.name).encode()]
         written_names = set()
         while attribute_match := _ATTRIBUTE.match(text, offset):
