@@ -53,8 +53,9 @@ def group_by_added_elements(acting: ActiveEffects, count: int) -> dict[AddedElem
     for effect, c in acting:
         added = list_added_elements(effect)
         if added:
-            # An effect in series with a joint is off where its first coefficient is not above zero.
-            is_active = c[0] > 0 if is_series_effect(effect) else c.any(axis=0)
+            # An effect in series with a joint is off where its first coefficient is not above zero,
+            # any other one where all coefficients are zero.
+            is_active = (c[0] > 0) if is_series_effect(effect) else (c != 0).any(axis=0)
             additions.append((added, is_active[:, 0]))
     groups: dict[AddedElements, list[int]] = {}
     for batch_index in range(count):
