@@ -295,7 +295,8 @@ def _solve_constraints(loops: _LoopModel) -> Array | None:
     for _ in range(MAX_STEPS):
         mujoco.mj_fwdPosition(model, data)
         jacobian = _get_equality_jacobian(model, data)
-        step[dofs] = -np.linalg.pinv(jacobian[:, dofs]) @ data.efc_pos[: data.ne]
+        residual = data.efc_pos[: data.ne]  # of the equality constraints, which come first
+        step[dofs] = -np.linalg.pinv(jacobian[:, dofs]) @ residual
         length = float(np.abs(step).max(initial=0.0))
         if length < POSITION_TOLERANCE:
             return jacobian

@@ -238,8 +238,10 @@ def _scale(find: Find) -> FieldWriter:
         (elements,) = find(robot, place)
         for element in elements:
             view = _view_element(fields, element)
-            # An element may be a vector, such as principal moments, which is scaled as a whole.
-            view *= compute_factor(c[0]).reshape(-1, *[1] * (view.ndim - 1))
+            # An element may be a vector, such as principal moments, which is scaled as a whole: the
+            # factor gets as many axes.
+            more_axes = [1] * (view.ndim - 1)
+            view *= compute_factor(c[0]).reshape(-1, *more_axes)
 
     return write
 
@@ -328,7 +330,9 @@ def get_coupling_address(robot: RobotModel, place: str) -> int:
         place: joint of the drive.
     """
     model = robot.compiled
-    return int(model.tendon_adr[model.tendon(place + COUPLING_TENDON_SUFFIX).id]) + 1
+    tendon = model.tendon(place + COUPLING_TENDON_SUFFIX).id
+    # The tendon lists the drive's own joint with the coefficient 1, then the preceding joint.
+    return int(model.tendon_adr[tendon]) + 1
 
 
 def _set_coupling(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:

@@ -23,7 +23,7 @@ def capture_mujoco_warnings() -> Iterator[list[str]]:
     import mujoco
 
     messages: list[str] = []
-    before = mujoco.get_mju_user_warning()
+    previous_handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda text: messages.append(format_mujoco_error(text)))
     try:
         with warnings.catch_warnings():
@@ -32,7 +32,7 @@ def capture_mujoco_warnings() -> Iterator[list[str]]:
             warnings.showwarning = lambda message, *_: messages.append(format_mujoco_error(message))
             yield messages
     finally:
-        mujoco.set_mju_user_warning(before)
+        mujoco.set_mju_user_warning(previous_handler)
 
 
 def format_mujoco_error(message: object) -> str:

@@ -349,9 +349,9 @@ class MeasuredLinear(RunLinearisation):
             similar: model of the same motion with the same Jacobians.
 
         Returns:
-            Changes (T - 1, Z) of the defects, the differences between the motion and the model's
-            own steps, in each interval between samples; and changes (T, C) of the readings of the
-            motion, at T samples of C channels.
+            Changes (T - 1, Z) of the defects, the differences of the Z state components between the
+            motion and the model's own steps, in each interval between samples; and changes (T, C)
+            of the readings of the motion, at T samples of C channels.
         """
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             changes = self._tangent.compute_defect_changes(similar._tangent)

@@ -153,8 +153,8 @@ class TangentModel:
     ) -> None:
         """Prepare the interpolation between points, and compute the difference quotients if needed.
 
-        A linearisation point is a step of the motion at which derivatives are computed. They are
-        used for this step and those that follow, until the next point.
+        A linearisation point is a step of the motion at which derivatives are computed. Consecutive
+        steps share a point: `point_of_step` has the point of each step.
 
         Args:
             at: linearisation points of the motion.
@@ -351,9 +351,11 @@ class TangentModel:
     def _mean_acceleration_forces(self) -> Array:
         """Forces (N, E) that convert accelerations at a state to mean accelerations over the step.
 
+        They act on the E velocities of joints and floating bodies at the N linearisation points.
         They represent the damping of an implicit integrator, and the motion of other joints within
         the step.
         """
+        # A change da of the acceleration needs the force M da, with the inertia matrix M.
         base_accelerations, _ = self._base_accelerations
         difference = self.accelerations[self._at.point_steps] - base_accelerations
         forces: Array = np.einsum("nij,nj->ni", self._mass_matrices, difference)
@@ -363,9 +365,10 @@ class TangentModel:
     def _accelerations_with_mean_forces(self) -> Array:
         """Accelerations (N, E) of the unperturbed motion with `_mean_acceleration_forces`.
 
-        They are the mean accelerations, except where a joint sticks, whose dry friction absorbs a
-        part of these forces. A difference from the mean accelerations would be a jump there, which
-        does not depend on the change of the model.
+        There are N linearisation points, and E velocities of joints and floating bodies. The
+        accelerations are the mean ones over a step, except where a joint sticks, whose dry friction
+        absorbs a part of these forces. A difference from the mean accelerations would be a jump
+        there, which does not depend on the change of the model.
         """
         accelerations, _ = self._at.compute_accelerations(
             self._at.acting, self._mean_acceleration_forces
@@ -583,9 +586,8 @@ class TangentModel:
         """Compute how the defects (S, Z) differ from those of a model with other parameters.
 
         The defect is the difference between the motion and the model's own step, so it changes by
-        the difference of both steps. A linearisation point stands for its own step and those that
-        follow until the next point. One step in their middle represents them all, unless commands
-        differ too.
+        the difference of both steps. Consecutive steps share a linearisation point. One step in the
+        middle between this point and the next one represents them all, unless commands differ too.
 
         Args:
             similar: model of the same motion.
@@ -598,7 +600,7 @@ class TangentModel:
             return self.defects - similar.defects
         ends = np.append(self._at.point_steps[1:], self._steps)
         middle = (self._at.point_steps + ends) // 2
-        # Evaluate steps from the middle instead of the point itself.
+        # Evaluate these steps instead of the linearisation points.
         with self._at.at_steps(middle):
             states, _ = self._at.step_displaced({}, self._at.acting)
         similar_states, _ = similar._every_step

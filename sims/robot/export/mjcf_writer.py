@@ -277,7 +277,10 @@ def _format_shortcut(
     gain = target_attributes["gainprm"][0]
     offset, stiffness, damping = target_attributes["biasprm"][:3]
     if name == "position" and offset == 0 and stiffness == -gain:
-        gains = {} if before and gain == before["gainprm"][0] else {"kp": format_number(gain)}
+        # Only the gain that differs is written.
+        gains = {}
+        if not before or gain != before["gainprm"][0]:
+            gains["kp"] = format_number(gain)
         if not before or damping != before["biasprm"][2]:
             gains["kv"] = format_number(-damping)
         return gains

@@ -127,9 +127,11 @@ def compute_file_totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | 
     robot = add_contact_pairs(robot, [e.place for e, _ in fitted if e.at == "contact"])
     file_fields = copy_model_fields(robot.compiled)
     changed_fields = copy_model_fields(robot.compiled)
+    # Some effects, such as a payload, must be written after others.
     for effect, values in sorted(
         fitted, key=lambda entry: get_write_order(_get_effect_name(entry[0]))
     ):
+        # Effects without numbers in the file change nothing here.
         if _read_numbers(file_fields, robot, effect):
             c = np.array(values, dtype=float)[:, None]
             MODEL_FIELD_EFFECTS[_get_effect_name(effect)].write(

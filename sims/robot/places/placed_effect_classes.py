@@ -520,12 +520,13 @@ def _needs_no_engine_support(effect: type[Effect]) -> bool:
     """
     if issubclass(effect, Input | Sensor):
         return True
-    # A force that needs more than its own joint is undefined at one of several joints.
-    has_known_need = effect.needs in ("", "guide", "input", "servo")
     if issubclass(effect, HiddenStateEffect):
-        # An effect that has a part of the joint's inertia overrides `behind`.
+        # With coefficients `between`, it is declared as an element between drive and load. An
+        # effect that moves a part of the joint's inertia itself overrides `behind`.
         return bool(effect.between) or effect.behind is HiddenStateEffect.behind
-    return has_known_need and issubclass(effect, Force | Friction)
+    # A force that needs more than its own joint is undefined at one of several joints.
+    needs_own_joint_only = effect.needs in ("", "guide", "input", "servo")
+    return needs_own_joint_only and issubclass(effect, Force | Friction)
 
 
 def _acts_at(
