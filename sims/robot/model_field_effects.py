@@ -207,7 +207,7 @@ def _view_element(fields: Fields, element: ModelField) -> Any:
     return fields[element.name][(slice(None), *element.address)]
 
 
-def _add(find: Find) -> FieldWriter:
+def _make_adding_writer(find: Find) -> FieldWriter:
     """Make a function that adds each coefficient to its number in the model, at least zero.
 
     Args:
@@ -224,7 +224,7 @@ def _add(find: Find) -> FieldWriter:
     return write
 
 
-def _scale(find: Find) -> FieldWriter:
+def _make_scaling_writer(find: Find) -> FieldWriter:
     """Make a function that scales a number of the model by 1 + c, in all fields that hold it.
 
     The factor is at least `MIN_FACTOR`, so that masses stay positive.
@@ -246,7 +246,7 @@ def _scale(find: Find) -> FieldWriter:
     return write
 
 
-def _shift(find: Find) -> FieldWriter:
+def _make_shifting_writer(find: Find) -> FieldWriter:
     """Make a function that adds each coefficient to its number in the model, without a limit.
 
     Args:
@@ -490,7 +490,7 @@ def _scale_radius(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
     fields["bvh_aabb"][:, volumes, 3:] += growth[:, None, None]
 
 
-def _scale_solref(index: int) -> FieldWriter:
+def _make_solref_writer(index: int) -> FieldWriter:
     """Make a function that scales the time constant t or the damping ratio z of a contact by 1 + c.
 
     MuJoCo's `solref` is (t, z), or in the direct form the negative stiffness and damping (-k, -b).
@@ -531,7 +531,7 @@ def _make_effect(
     """Make an effect whose coefficients all change their elements in the same way.
 
     Args:
-        make_writer: makes the function that changes the elements: `_add`, `_scale` or `_shift`.
+        make_writer: makes the function that changes the elements: it adds, scales or shifts.
         find: finds the elements of each coefficient.
         *fields: names of the fields with these elements.
         changes_derived_constants: as in `ModelFieldEffect`.
@@ -541,18 +541,27 @@ def _make_effect(
 
 
 MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
-    "drag.linear": _make_effect(_add, _make_finder("dof_damping"), "dof_damping"),
-    "drag.quadratic": _make_effect(_add, _make_finder("dof_dampingpoly", 0), "dof_dampingpoly"),
+    "drag.linear": _make_effect(_make_adding_writer, _make_finder("dof_damping"), "dof_damping"),
+    "drag.quadratic": _make_effect(
+        _make_adding_writer, _make_finder("dof_dampingpoly", 0), "dof_dampingpoly"
+    ),
     "friction.coulomb": ModelFieldEffect(
         ("dof_frictionloss", "dof_solref", "dof_solimp"),
         _add_friction,
         find=_make_finder("dof_frictionloss"),
     ),
-    "spring.linear": _make_effect(_add, _make_finder("jnt_stiffness"), "jnt_stiffness"),
+    "spring.linear": _make_effect(
+        _make_adding_writer, _make_finder("jnt_stiffness"), "jnt_stiffness"
+    ),
     # A spring may soften.
-    "spring.cubic": _make_effect(_shift, _make_finder("jnt_stiffnesspoly", 1), "jnt_stiffnesspoly"),
+    "spring.cubic": _make_effect(
+        _make_shifting_writer, _make_finder("jnt_stiffnesspoly", 1), "jnt_stiffnesspoly"
+    ),
     "inertia.armature": _make_effect(
-        _add, _make_finder("dof_armature"), "dof_armature", changes_derived_constants=True
+        _make_adding_writer,
+        _make_finder("dof_armature"),
+        "dof_armature",
+        changes_derived_constants=True,
     ),
     "mass.scale": ModelFieldEffect(
         ("body_mass", "body_inertia"),
@@ -561,25 +570,31 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
         find=_make_finder("body_mass"),
     ),
     "mass.offset": _make_effect(
-        _shift,
+        _make_shifting_writer,
         _find_mass_centre_fields,
         "body_ipos",
         changes_derived_constants=True,
         operation="add",
     ),
     "inertia.scale": _make_effect(
-        _scale,
+        _make_scaling_writer,
         _make_finder("body_inertia"),
         "body_inertia",
         changes_derived_constants=True,
         operation="scale",
     ),
-    "actuator.stiffness": _make_effect(_scale, _make_servo_gain_finder(1), *_SERVO_FIELDS),
-    "actuator.damping": _make_effect(_scale, _make_servo_gain_finder(2), *_SERVO_FIELDS),
-    "joint.zero": ModelFieldEffect(("qpos0",), _shift(_make_finder("qpos0"))),
+    "actuator.stiffness": _make_effect(
+        _make_scaling_writer, _make_servo_gain_finder(1), *_SERVO_FIELDS
+    ),
+    "actuator.damping": _make_effect(
+        _make_scaling_writer, _make_servo_gain_finder(2), *_SERVO_FIELDS
+    ),
+    "joint.zero": ModelFieldEffect(("qpos0",), _make_shifting_writer(_make_finder("qpos0"))),
     "joint.axis": ModelFieldEffect(("jnt_axis",), _turn_axis, changes_derived_constants=True),
     "link.length": ModelFieldEffect(
-        ("body_pos",), _scale(_make_finder("body_pos")), changes_derived_constants=True
+        ("body_pos",),
+        _make_scaling_writer(_make_finder("body_pos")),
+        changes_derived_constants=True,
     ),
     "gravity.compensation": ModelFieldEffect(
         ("body_gravcomp",), _compensate_gravity, changes_derived_constants=True
@@ -602,8 +617,8 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
     ),
     "joint.coupling": ModelFieldEffect((COUPLING_FIELD,), _set_coupling),
     "contact.friction": ModelFieldEffect(("pair_friction",), _add_contact_friction),
-    "contact.softness": ModelFieldEffect(("pair_solref",), _scale_solref(0)),
-    "contact.damping": ModelFieldEffect(("pair_solref",), _scale_solref(1)),
+    "contact.softness": ModelFieldEffect(("pair_solref",), _make_solref_writer(0)),
+    "contact.damping": ModelFieldEffect(("pair_solref",), _make_solref_writer(1)),
     "geom.radius": ModelFieldEffect(
         ("geom_size", "geom_rbound", "geom_aabb", "bvh_aabb"), _scale_radius
     ),

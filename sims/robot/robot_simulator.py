@@ -118,7 +118,7 @@ class RobotSimulator(SystemSimulator):
         if repeated_names:
             raise InputError(f"effect {repeated_names[0]}: its coefficient is free already")
         freed_effects = self.system.freed_effects
-        self._freed: list[Effect] = [effect() for effect in freed_effects]
+        self._freed_effects: list[Effect] = [effect() for effect in freed_effects]
         self.robotic = self.system()
         self.addresses = JointAddresses(self.robot)
         self._floating = FloatingJoints.from_robot(self.robot)
@@ -205,7 +205,7 @@ class RobotSimulator(SystemSimulator):
         """
         effects: list[tuple[Effect, Array]] = []
         column = 0
-        for effect in self._freed:
+        for effect in self._freed_effects:
             count = len(effect.coefficients)
             c = theta[:, column : column + count].T[:, :, None]  # (K, L, 1)
             effects.append((effect, c))

@@ -71,8 +71,8 @@ class ForceRanges:
     """
 
     def __init__(self, fields: Mapping[str, Any]) -> None:
-        self._limited, self._range = (fields[name] for name in FORCE_FIELDS)
-        self._initial = self._limited.copy(), self._range.copy()
+        self._limit_flags, self._force_ranges = (fields[name] for name in FORCE_FIELDS)
+        self._values_when_on = self._limit_flags.copy(), self._force_ranges.copy()
 
     def write(self, off: Mask) -> None:
         """Switch actuators of the first n batch elements off where `off` (n, K) is true.
@@ -80,14 +80,14 @@ class ForceRanges:
         All their other actuators are switched on: they get the force ranges that they had when this
         object was created.
         """
-        limited, ranges = self._initial
+        limit_flags, force_ranges = self._values_when_on
         n = len(off)
-        self._limited[:n] = np.where(off, True, limited[:n])
-        self._range[:n] = np.where(off[..., None], 0.0, ranges[:n])
+        self._limit_flags[:n] = np.where(off, True, limit_flags[:n])
+        self._force_ranges[:n] = np.where(off[..., None], 0.0, force_ranges[:n])
 
     def restore(self) -> None:
         """Switch all actuators on."""
-        self._limited[...], self._range[...] = self._initial
+        self._limit_flags[...], self._force_ranges[...] = self._values_when_on
 
 
 def find_working_servos(robot: RobotModel, velocities: Any, off: Mask) -> Array:

@@ -127,8 +127,9 @@ class StepForces:
         self.prepared = PreparedProgram(program, len(stiffness))
         self.registers = registers = self.prepared.r
         groups = [slice(*ends) for ends in pairwise(function.input_ends)]
-        self._t, self._midpoint_time, step_group, self._interval, *groups = groups
-        *self._motion, self._u, self._stiffness_group, coefficient_group, self._states = groups
+        self._time_group, self._midpoint_time_group, step_group, self._interval_group = groups[:4]
+        *self._motion_groups, self._input_group = groups[4:-3]
+        self._stiffness_group, coefficient_group, self._state_group = groups[-3:]
         registers[step_group] = step
         registers[self._stiffness_group] = stiffness.T
         registers[coefficient_group] = effects.coefficients
@@ -186,8 +187,10 @@ class StepForces:
     @property
     def layout(self) -> CallbackLayout:
         """First registers of the groups that MuJoCo's callback reads and writes."""
-        x, v, a, *_ = self._motion
-        groups = self._t, self._midpoint_time, self._interval, x, v, a, self._u, self._states
+        x, v, a, *_ = self._motion_groups
+        times = self._time_group, self._midpoint_time_group, self._interval_group
+        # In the order of the fields of the layout.
+        groups = (*times, x, v, a, self._input_group, self._state_group)
         return CallbackLayout(*(group.start for group in groups))
 
     def begin(self, joint_states: JointStates) -> None:
@@ -212,7 +215,7 @@ class StepForces:
         states = [effect.begin(c, snapshot) for effect, c in self._hidden]
         # A hidden state has a position x and a rate v, (L, 1) each.
         parts = [part for state in states for part in (state.x, state.v)]
-        self.registers[self._states] = np.concatenate(parts, axis=1).T
+        self.registers[self._state_group] = np.concatenate(parts, axis=1).T
 
     def compute(self, k: int, joint_states: JointStates) -> tuple[Array, Array]:
         """Compute forces and dry friction limits (L, D) at the middle of step k, in N or N m.
@@ -227,14 +230,14 @@ class StepForces:
             joint_states: joint states at the beginning of the step.
         """
         registers = self.registers
-        for rows, values in zip(self._motion, joint_states, strict=True):
+        for rows, values in zip(self._motion_groups, joint_states, strict=True):
             registers[rows] = values.T
-        registers[self._t] = k * self.step
-        registers[self._midpoint_time] = (k + 0.5) * self.step
+        registers[self._time_group] = k * self.step
+        registers[self._midpoint_time_group] = (k + 0.5) * self.step
         # Without inputs there is one row, which holds for all steps.
-        registers[self._u] = self.input_values[min(k, len(self.input_values) - 1)]
+        registers[self._input_group] = self.input_values[min(k, len(self.input_values) - 1)]
         # Hidden states advance from the middle of the previous step to the middle of this one.
-        registers[self._interval] = self.step if k else 0.5 * self.step
+        registers[self._interval_group] = self.step if k else 0.5 * self.step
         if self._working is not None:
             registers[self._stiffness_group] = (self._stiffness * self._working[:, k]).T
         if k == 0:
@@ -242,7 +245,7 @@ class StepForces:
         self._run()
         # Numbers of the registers with the results; the hidden states begin the next step.
         ((force, limit, states),) = self.prepared.program.outputs
-        registers[self._states] = registers[states]
+        registers[self._state_group] = registers[states]
         return registers[force].T, registers[limit].T
 
 

@@ -157,7 +157,7 @@ class MeasuredLinear(RunLinearisation):
             self.observed = self._observe_nominal_motion()
         # Numbers (T,) of the steps at whose beginnings the samples are.
         knots = np.rint(self._times / self._simulator.time_step).astype(np.intp)
-        self.knots: IndexArray = np.clip(knots, 0, self._steps)
+        self.knots: IndexArray = np.clip(knots, 0, self._step_count)
 
     @property
     def step(self) -> float:
@@ -191,7 +191,7 @@ class MeasuredLinear(RunLinearisation):
         x, v = motion.x.copy(), motion.v.copy()
         x[:, :joint_count], v[:, :joint_count] = trajectory.x, trajectory.v
         given_motion = replace(motion, x=x, v=v, floating_state=trajectory.floating_state)
-        simulator, acting = self._simulator, self._work.acting
+        simulator, acting = self._simulator, self._run_batch.acting
         has_load_effect = any(e.of in LOAD_DEPENDENT_EFFECTS for e, _ in acting)
         if self._reuses_loads and not has_load_effect:
             return given_motion
@@ -212,7 +212,7 @@ class MeasuredLinear(RunLinearisation):
         if self._nearby is None or self._trajectory is None:
             return None
         # A motion has one step more than its run.
-        motion, steps = self._nearby._motion, self._steps + 1
+        motion, steps = self._nearby._motion, self._step_count + 1
         joint_count = len(self._simulator.addresses.positions)
         has_other_states = (
             motion.x.shape[1] != joint_count  # joints in series
@@ -220,11 +220,11 @@ class MeasuredLinear(RunLinearisation):
             or motion.floating_state.pose.size > 0
         )
         # An active effect of this model may add a joint in series that `nearby` does not have.
-        adds_joint = any(is_series_effect(effect) for effect, _ in self._work.acting)
+        adds_joint = any(is_series_effect(effect) for effect, _ in self._run_batch.acting)
         if has_other_states or adds_joint:
             return None
         self._readings = dict(self._nearby._readings)
-        inputs = self._simulator.compute_controls(self._work, steps)
+        inputs = self._simulator.compute_controls(self._run_batch, steps)
         return replace(
             motion,
             compute_loads=lambda: motion.carried,
@@ -393,7 +393,7 @@ class MeasuredLinear(RunLinearisation):
         between two of the T samples is added to the process noise of a filter. The Z state
         components begin with positions, then velocities; the other ones do not jump.
         """
-        mujoco_batch = self._simulator.make_linearisation_batch(self._work.acting)
+        mujoco_batch = self._simulator.make_linearisation_batch(self._run_batch.acting)
         limits = mujoco_batch.force_limits
         state_changes = np.zeros((self.knots.size - 1, self._tangent.state_size))
         if not limits.outputs:  # no stiff servo has a limit
@@ -422,14 +422,14 @@ class MeasuredLinear(RunLinearisation):
         components.
         """
         simulator, tangent = self._simulator, self._tangent
-        model = simulator.make_linearisation_batch(self._work.acting).model
+        model = simulator.make_linearisation_batch(self._run_batch.acting).model
         is_runge_kutta = forces_are_at_step_end(model)  # a property of this integrator only
         if is_runge_kutta:
             return np.zeros((self.knots.size - 1, tangent.state_size))
         with np.errstate(all="ignore"), capture_mujoco_warnings():
             # Errors (N, Z) of one step at the N linearisation points; each step has those of its
             # point.
-            errors = tangent.step_errors(simulator.make_half_step_batch(self._work.acting))
+            errors = tangent.step_errors(simulator.make_half_step_batch(self._run_batch.acting))
             return self._compose(errors, rows=tangent.point_of_step)
 
     def _list_active_intervals(self) -> list[tuple[IndexArray, IndexArray]]:
@@ -629,7 +629,7 @@ class MeasuredLinear(RunLinearisation):
         pose = motion.floating_state.pose
         if displacements.size:
             # Displacements include rotations, which cannot be added to a pose with quaternions.
-            floating = self._simulator.make_linearisation_batch(self._work.acting).floating
+            floating = self._simulator.make_linearisation_batch(self._run_batch.acting).floating
             pose = floating.displace(pose, displacements)
         return Trajectory(
             motion.x[:, :file_joints] + deviations[:, :file_joints],

@@ -81,11 +81,11 @@ class RunLinearisation:
         self._simulator = simulator
         self._clock = float(scenario.times[0])  # time stamp of the first sample
         self._times = scenario.times - self._clock
-        self._steps = simulator.count_steps(self._times)
+        self._step_count = simulator.count_steps(self._times)
         acting = simulator.get_active_effects(theta[None])
         commands = simulator.run_inputs(scenario)
         # The run as a batch of one element, with its active effects.
-        self._work = RobotRunBatch(scenario, commands, acting, x[None], v[None])
+        self._run_batch = RobotRunBatch(scenario, commands, acting, x[None], v[None])
         # Channels that observe MuJoCo's sensors: drive forces (tau.) and sensors (s.).
         self._sensor_channels = [
             c.name for c in simulator.channels if c.name.startswith(("tau.", "s."))
@@ -99,7 +99,7 @@ class RunLinearisation:
         self._perturbation_cache: dict[tuple[str, bytes], tuple[Array, Array]] = {}
         self.observed = self._observe_nominal_motion()
         # Number of the joints of the file, which come first; joints in series follow them.
-        self._joints = len(simulator.addresses.positions)
+        self._joint_count = len(simulator.addresses.positions)
 
     def _observe_nominal_motion(self) -> Array:
         """Return the observations (T, C) of the motion without perturbations."""
@@ -118,10 +118,12 @@ class RunLinearisation:
         `_readings`, by channel.
         """
         simulator = self._simulator
-        steps = self._steps + 1
-        inputs = simulator.compute_controls(self._work, steps)
-        simulated = simulator.step_batch(self._work, inputs, (*TRANSMISSION_FORCE_FIELDS, "act"))
-        mujoco_batch = simulator.make_linearisation_batch(self._work.acting)
+        steps = self._step_count + 1
+        inputs = simulator.compute_controls(self._run_batch, steps)
+        simulated = simulator.step_batch(
+            self._run_batch, inputs, (*TRANSMISSION_FORCE_FIELDS, "act")
+        )
+        mujoco_batch = simulator.make_linearisation_batch(self._run_batch.acting)
         # The batch has one element.
         fields = {name: values[0] for name, values in simulated.fields.items()}
         dofs = mujoco_batch.all_joints.velocities
@@ -158,7 +160,7 @@ class RunLinearisation:
         """
         return {
             "controls": inputs.controls[0],
-            "forces": self._simulator.make_linearisation_batch(self._work.acting).map_forces(
+            "forces": self._simulator.make_linearisation_batch(self._run_batch.acting).map_forces(
                 inputs.forces[0]
             ),
             "instant": inputs.instant[0],
@@ -175,8 +177,8 @@ class RunLinearisation:
         Returns:
             Poses (S + 1, P) and velocities (S + 1, F).
         """
-        start = self._simulator.get_floating_start(self._work)
-        floating = self._simulator.make_linearisation_batch(self._work.acting).floating
+        start = self._simulator.get_floating_start(self._run_batch)
+        floating = self._simulator.make_linearisation_batch(self._run_batch.acting).floating
         pose = fields["qpos"][0][:, floating.positions]
         rate = fields["qvel"][0][:, floating.velocities]
         return FloatingState(
@@ -189,7 +191,7 @@ class RunLinearisation:
         outputs = [
             ("sensordata", simulator.get_sensor_address(name)) for name in self._sensor_channels
         ]
-        mujoco_batch = simulator.make_linearisation_batch(self._work.acting)
+        mujoco_batch = simulator.make_linearisation_batch(self._run_batch.acting)
         # Typical forces in N or N m, for finite differences: of the joints of the file, of joints
         # in series (the second joints of flexible drives), and of floating bodies. A joint in
         # series transmits the force of its joint.
@@ -202,7 +204,7 @@ class RunLinearisation:
             mujoco_batch,
             simulator.robotic,
             self._motion,
-            self._work.acting,
+            self._run_batch.acting,
             outputs,
             mujoco_batch.all_joints,
             [self._find_driven_joint(name) for name in self._sensor_channels],
@@ -311,9 +313,9 @@ class RunLinearisation:
         more. An added effect that contains a simpler one of the run, as Stribeck friction contains
         Coulomb friction, takes its coefficient over and replaces it.
         """
-        count, work = len(added), self._work
+        count, run = len(added), self._run_batch
         # Coefficients (k, K, 1) of the effects of the run, in all elements.
-        run_effects = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
+        run_effects = [(e, np.repeat(c, count, axis=1)) for e, c in run.acting]
         # Each added effect has coefficients in its own element, and zeros in all others.
         added_effects = []
         for element, (effect, c) in enumerate(added):
@@ -325,8 +327,8 @@ class RunLinearisation:
             coefficients[:, element, 0] = c
             added_effects.append((effect, coefficients))
         acting = (*run_effects, *added_effects)
-        x, v = np.repeat(work.x, count, axis=0), np.repeat(work.v, count, axis=0)
-        return self._simulator.simulate_observations(work._replace(acting=acting, x=x, v=v))
+        x, v = np.repeat(run.x, count, axis=0), np.repeat(run.v, count, axis=0)
+        return self._simulator.simulate_observations(run._replace(acting=acting, x=x, v=v))
 
     def compute_initial_state_responses(self) -> Array:
         """Compute the derivatives of observations by initial positions and velocities.
@@ -345,7 +347,7 @@ class RunLinearisation:
         derivatives: Array = (observations - self.observed) / small_change
         by_position, by_velocity = np.split(derivatives, 2)
         # Joints in series, which come last, are left out.
-        return np.concatenate([by_position[: self._joints], by_velocity[: self._joints]])
+        return np.concatenate([by_position[: self._joint_count], by_velocity[: self._joint_count]])
 
     def _list_perturbations(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
         """Return the perturbations by an effect that acts on neither inputs nor sensors.
@@ -380,7 +382,7 @@ class RunLinearisation:
             # small share of it is made, and the result is divided by the share.
             is_geometry = "geom_size" in MODEL_FIELD_EFFECTS[name].fields
             share = GEOMETRY_DIFFERENCE_SHARE if is_geometry else 1.0
-            acting = (*self._work.acting, (effect, share * c))
+            acting = (*self._run_batch.acting, (effect, share * c))
             with capture_mujoco_warnings():
                 mujoco_batch = self._simulator.make_linearisation_batch(acting)
                 self._perturbation_cache[key] = self._tangent.perturb_model_numbers(
@@ -420,14 +422,14 @@ class RunLinearisation:
         # Effects by name, with coefficients (K, n, 1): those of the run in all elements, then one
         # further effect in each element.
         acting: dict[str, tuple[Effect, Array]] = {}
-        for run_effect, run_c in self._work.acting:
+        for run_effect, run_c in self._run_batch.acting:
             if isinstance(run_effect, Input):
                 acting[run_effect.name] = run_effect, np.repeat(run_c, count, axis=1)
         for element, (effect, c) in enumerate(input_effects):
             _, coefficients = acting.setdefault(effect.name, (effect, np.zeros((len(c), count, 1))))
             coefficients[:, element] = c[:, 0]
         steps = len(self._motion.controls)
-        scenario, commands = self._work.scenario, self._work.commands
+        scenario, commands = self._run_batch.scenario, self._run_batch.commands
         return RunInputs(scenario, commands, tuple(acting.values()), count, steps)
 
     def _compute_observations(
@@ -445,9 +447,9 @@ class RunLinearisation:
             sensors: further sensor effects of each of the n motions.
         """
         simulator, count = self._simulator, len(states)
-        instants = self._steps + 1  # beginnings of the steps of the run, and its end
+        instants = self._step_count + 1  # beginnings of the steps of the run, and its end
         position_count = self._motion.x.shape[1]
-        run_effects = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._work.acting)
+        run_effects = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._run_batch.acting)
         columns = []
         sample_steps = find_sample_steps(simulator.time_step, self._times, instants)
         for channel in simulator.channels:

@@ -135,7 +135,7 @@ class LinearisationPoints:
         self._mujoco_batch, self._system = mujoco_batch, system
         self._outputs = tuple(outputs)
         self._joints = joints
-        self._drives = np.array(tuple(drives) or (-1,) * len(self._outputs), dtype=np.intp)
+        self._joint_of_output = np.array(tuple(drives) or (-1,) * len(self._outputs), dtype=np.intp)
         # Forces (n, D) of effects in drives, which a sensor of drive forces shows.
         self._drive_effect_forces = np.zeros((0, 0))
         self._floating = mujoco_batch.floating
@@ -206,12 +206,12 @@ class LinearisationPoints:
     @property
     def reads_drives(self) -> bool:
         """True if any output is a drive force."""
-        return bool((self._drives >= 0).any())
+        return bool((self._joint_of_output >= 0).any())
 
     @property
     def reads_others(self) -> bool:
         """True if any output is not a drive force."""
-        return bool((self._drives < 0).any())
+        return bool((self._joint_of_output < 0).any())
 
     @property
     def has_contacts(self) -> bool:
@@ -332,9 +332,9 @@ class LinearisationPoints:
             return np.zeros((n, 0))
         readings = np.concatenate(columns, axis=1)
         if self._drive_effect_forces.size:
-            # `_drives` has the joint of each output that is a drive force, and -1 for others.
-            is_drive = self._drives >= 0
-            readings[:, is_drive] += self._drive_effect_forces[:, self._drives[is_drive]]
+            # An output that is no drive force has the joint -1.
+            is_drive = self._joint_of_output >= 0
+            readings[:, is_drive] += self._drive_effect_forces[:, self._joint_of_output[is_drive]]
         return readings
 
     @cached_property
@@ -535,15 +535,15 @@ class LinearisationPoints:
         They show at which points a force limit is reached, where the linear model is not
         valid.
         """
-        previous = self._outputs, self._drives
+        previous = self._outputs, self._joint_of_output
         self._outputs = self._mujoco_batch.force_limits.outputs
         # No output counts as the reading of a drive-force sensor, to which effects would be added.
-        self._drives = np.full(len(self._outputs), -1)
+        self._joint_of_output = np.full(len(self._outputs), -1)
         self._bind_fields(self._mujoco_batch)
         try:
             yield
         finally:
-            self._outputs, self._drives = previous
+            self._outputs, self._joint_of_output = previous
 
     def compute_mass_matrices(self) -> Array:
         """Compute the inertia matrix (N, E, E) at each of the N points.
@@ -586,7 +586,7 @@ class LinearisationPoints:
             readings: (N, O) readings of the O outputs without the effect.
         """
         # Outputs that are no drive forces have the joint -1.
-        motion, steps, joint_of_output = self.motion, self.point_steps, self._drives
+        motion, steps, joint_of_output = self.motion, self.point_steps, self._joint_of_output
         is_drive = joint_of_output >= 0
         # The effect depends on the drive forces, the first of both loads of a transmission. The
         # motion has those at the middle of a step; readings are at its beginning.

@@ -163,17 +163,19 @@ class TangentModel:
             quotients: difference quotients of another motion nearby, to be used for this one;
                 computed if None, or if they belong to other points.
         """
-        self._at, self._motion = at, at.motion
-        self._sizes = sizes
-        self._steps = len(at.motion.controls)
+        self._points, self._motion = at, at.motion
+        self._typical_forces = sizes
+        self._step_count = len(at.motion.controls)
         # Distance (S,) of each of the S steps from its linearisation point, as a share of the
         # regular distance between points.
-        step_numbers = np.arange(self._steps)
-        self._share: Array = (step_numbers - at.point_steps[at.point_of_step]) / at.point_spacing
+        step_numbers = np.arange(self._step_count)
+        self._distance_share: Array = (
+            step_numbers - at.point_steps[at.point_of_step]
+        ) / at.point_spacing
         # Indices (S,) of the two points between which values at points are interpolated to a step.
         earlier_points, later_points = _find_neighbours(at.point_steps, at.point_spacing)
-        self._earlier = earlier_points[at.point_of_step]
-        self._later = later_points[at.point_of_step]
+        self._earlier_point = earlier_points[at.point_of_step]
+        self._later_point = later_points[at.point_of_step]
         # If commands change at other times, the linearisation points differ.
         points_and_states = at.point_steps.size, self.state_size
         if quotients is None or quotients.states.shape[:2] != points_and_states:
@@ -183,23 +185,23 @@ class TangentModel:
     @cached_property
     def _base_step(self) -> tuple[Array, Array]:
         """States (N, Z) after an unperturbed step from each point, and readings (N, O)."""
-        return self._at.step_displaced({}, self._at.acting)
+        return self._points.step_displaced({}, self._points.acting)
 
     @property
     def _base_readings(self) -> Array:
-        at_points = self._at.steps_joints_by_runge_kutta
+        at_points = self._points.steps_joints_by_runge_kutta
         _, readings = self._base_accelerations if at_points else self._base_step
         return readings
 
     @cached_property
     def _base_accelerations(self) -> tuple[Array, Array]:
         """Accelerations (N, E) and readings (N, O) of the unperturbed motion."""
-        return self._at.compute_accelerations(self._at.acting)
+        return self._points.compute_accelerations(self._points.acting)
 
     @property
     def placed_element_count(self) -> int:
         """Number of batch elements that were placed at linearisation points so far."""
-        return self._at.placed_count
+        return self._points.placed_count
 
     @property
     def state_size(self) -> int:
@@ -208,9 +210,9 @@ class TangentModel:
         They are positions, velocities, activations, hidden states of effects, and displacements and
         velocities of floating bodies.
         """
-        velocities = self._sizes.size  # of joints and of floating bodies
+        velocities = self._typical_forces.size  # of joints and of floating bodies
         activations = self._motion.act.shape[1]
-        hidden_states = len(self._at.hidden_state_effects)
+        hidden_states = len(self._points.hidden_state_effects)
         # Each velocity has a position of the joint, or a displacement of the floating body.
         size: int = 2 * velocities + activations + hidden_states
         return size
@@ -229,28 +231,30 @@ class TangentModel:
         # a activation, w hidden state of an effect, p and r displacement and velocity of floating
         # bodies, f force, u control. The order is that of the components of a state.
         joint_count = self._motion.x.shape[1]
-        floating_count = self._sizes.size - joint_count
+        floating_count = self._typical_forces.size - joint_count
         na, nu = self._motion.act.shape[1], self._motion.controls.shape[1]
         displacements: dict[str, list[tuple[str, int, float]]] = {
             "state": [("q", j, POSITION_DIFFERENCE) for j in range(joint_count)]
             + [("v", j, VELOCITY_DIFFERENCE) for j in range(joint_count)]
             + [("a", j, CONTROL_DIFFERENCE) for j in range(na)]
-            + [("w", k, CONTROL_DIFFERENCE) for k in self._at.hidden_state_effects]
+            + [("w", k, CONTROL_DIFFERENCE) for k in self._points.hidden_state_effects]
             + [("p", j, POSITION_DIFFERENCE) for j in range(floating_count)]
             + [("r", j, VELOCITY_DIFFERENCE) for j in range(floating_count)],
             "force": [
-                ("f", j, FORCE_DIFFERENCE_SHARE * float(self._sizes[j]))
+                ("f", j, FORCE_DIFFERENCE_SHARE * float(self._typical_forces[j]))
                 for j in range(joint_count + floating_count)
             ],
             "control": [("u", j, CONTROL_DIFFERENCE) for j in range(nu)],
         }
         # 2. Differences of the results: accelerations, or states after a step.
-        if self._at.steps_joints_by_runge_kutta:
+        if self._points.steps_joints_by_runge_kutta:
             # In the middle of the steps for which a derivative is used.
-            evaluate = partial(self._at.compute_accelerations, self._at.acting, at_centres=True)
+            evaluate = partial(
+                self._points.compute_accelerations, self._points.acting, at_centres=True
+            )
             unchanged_results, unchanged_readings = evaluate()
         else:
-            evaluate = partial(self._at.step_displaced, acting=self._at.acting)
+            evaluate = partial(self._points.step_displaced, acting=self._points.acting)
             unchanged_results, unchanged_readings = self._base_step
         quotients: list[tuple[Array, Array]] = []
         for group in displacements.values():
@@ -261,7 +265,7 @@ class TangentModel:
                 forward = (results - unchanged_results) / difference
                 derivatives[:, :, column] = forward
                 reading_derivatives[:, :, column] = (readings - unchanged_readings) / difference
-                if name == "q" and self._at.has_contacts:
+                if name == "q" and self._points.has_contacts:
                     # The force of a contact that begins or ends within the difference jumps.
                     results, readings = evaluate(moved={name: (j, -difference)})
                     backward = (unchanged_results - results) / difference
@@ -272,7 +276,7 @@ class TangentModel:
             quotients.append((derivatives, reading_derivatives))
         (by_state, by_force, by_control), of_readings = zip(*quotients, strict=True)
         # 3. Derivatives of a Runge-Kutta step.
-        if self._at.steps_joints_by_runge_kutta:
+        if self._points.steps_joints_by_runge_kutta:
             by_state, by_force, by_control = compute_runge_kutta_step(
                 by_state, by_force, by_control, self._motion.step
             )
@@ -300,16 +304,16 @@ class TangentModel:
             Equivalent forces (N, E) on the E velocities of joints and floating bodies, and direct
             changes (N, O) of the O readings at unchanged states, both divided by `change`.
         """
-        if self._at.has_contacts and not self._at.steps_joints_by_runge_kutta:
+        if self._points.has_contacts and not self._points.steps_joints_by_runge_kutta:
             return self._perturb_numbers_at_contacts(acting, change, mujoco_batch)
         # With these forces the unchanged model has its mean accelerations over a step.
         step_mean_forces = self._mean_acceleration_forces
-        with self._at.with_batch(mujoco_batch):
-            accelerations, readings = self._at.compute_accelerations(acting, step_mean_forces)
+        with self._points.with_batch(mujoco_batch):
+            accelerations, readings = self._points.compute_accelerations(acting, step_mean_forces)
             # Sensors of drive forces do not depend on these applied forces, but others do, such as
             # an accelerometer. Then all are read without these forces, like the base readings.
-            if self._at.reads_others:
-                _, readings = self._at.compute_accelerations(acting)
+            if self._points.reads_others:
+                _, readings = self._points.compute_accelerations(acting)
         difference = (accelerations - self._accelerations_with_mean_forces) / change
         force = np.einsum("nij,nj->ni", self._mass_matrices, difference)
         _, base_readings = self._base_accelerations
@@ -334,10 +338,10 @@ class TangentModel:
             Equivalent forces (N, E) on E joints at N points, and direct changes (N, O) of O
             readings, both divided by `change`.
         """
-        with self._at.with_batch(mujoco_batch):
-            ends, readings = self._at.step_displaced({}, acting)
+        with self._points.with_batch(mujoco_batch):
+            ends, readings = self._points.step_displaced({}, acting)
         # A state begins with the positions and the velocities of the E joints.
-        joint_count = self._sizes.size
+        joint_count = self._typical_forces.size
         velocities = slice(joint_count, 2 * joint_count)
         base_ends, _ = self._base_step  # states after a step without the change
         difference = (ends - base_ends)[:, velocities] / change
@@ -357,7 +361,7 @@ class TangentModel:
         """
         # A change da of the acceleration needs the force M da, with the inertia matrix M.
         base_accelerations, _ = self._base_accelerations
-        difference = self.accelerations[self._at.point_steps] - base_accelerations
+        difference = self.accelerations[self._points.point_steps] - base_accelerations
         forces: Array = np.einsum("nij,nj->ni", self._mass_matrices, difference)
         return forces
 
@@ -370,8 +374,8 @@ class TangentModel:
         absorbs a part of these forces. A difference from the mean accelerations would be a jump
         there, which does not depend on the change of the model.
         """
-        accelerations, _ = self._at.compute_accelerations(
-            self._at.acting, self._mean_acceleration_forces
+        accelerations, _ = self._points.compute_accelerations(
+            self._points.acting, self._mean_acceleration_forces
         )
         return accelerations
 
@@ -387,30 +391,32 @@ class TangentModel:
             c: coefficients (K, 1, 1).
         """
         # Forces (S, D) on D joints along the motion of S steps.
-        forces = self._at.compute_effect_force(effect, c)
+        forces = self._points.compute_effect_force(effect, c)
         changes = [
             Perturbation(owner, joint=joint, series=series)
             for joint, series in enumerate(forces.T)
             if np.abs(series).max() > 0
         ]
-        if is_in_drive(effect) and self._at.reads_drives:
+        if is_in_drive(effect) and self._points.reads_drives:
             changes.append(
                 Perturbation(
                     owner,
-                    readings=self._at.compute_drive_reading_changes(effect, c, self._base_readings),
+                    readings=self._points.compute_drive_reading_changes(
+                        effect, c, self._base_readings
+                    ),
                 )
             )
         return changes
 
     @cached_property
     def _mass_matrices(self) -> Array:
-        return self._at.compute_mass_matrices()
+        return self._points.compute_mass_matrices()
 
     @cached_property
     def accelerations(self) -> Array:
         """Mean accelerations (S, E) over each of S steps, from the velocities at its ends."""
         motion = self._motion
-        result: Array = np.diff(motion.velocities, axis=0)[: self._steps] / motion.step
+        result: Array = np.diff(motion.velocities, axis=0)[: self._step_count] / motion.step
         return result
 
     # -- propagation over time
@@ -436,7 +442,7 @@ class TangentModel:
         """
         quotients = self.quotients
         state_size = quotients.forces.shape[1]
-        steps = self._steps
+        steps = self._step_count
         inputs, readings = self.sum_inputs_and_readings(changes, count)
         # States, forces and controls of each step are stacked, so that a step is one matrix product
         # with [A, B, C]. Its result is the state part of the next step.
@@ -448,7 +454,7 @@ class TangentModel:
             np.concatenate([quotients.states, quotients.forces, quotients.controls], axis=2)
         )
         stacked_steps = list(stacked)
-        for step_index, point in enumerate(self._at.point_of_step.tolist()):
+        for step_index, point in enumerate(self._points.point_of_step.tolist()):
             np.matmul(
                 step_matrices[point],
                 stacked_steps[step_index],
@@ -457,7 +463,7 @@ class TangentModel:
         # Readings change directly (so far), and by the changed states.
         if readings.shape[1]:
             readings += np.matmul(
-                quotients.read_states[self._at.point_of_step], stacked[:-1, :state_size]
+                quotients.read_states[self._points.point_of_step], stacked[:-1, :state_size]
             )
         states = stacked[:, :state_size]
         return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
@@ -480,9 +486,9 @@ class TangentModel:
             Changes (S, E + nu, n) of E forces and nu controls in S steps; and changes (S, O, n) of
             O readings at unchanged states.
         """
-        quotients, steps = self.quotients, self._steps
+        quotients, steps = self.quotients, self._step_count
         force_count, control_count = quotients.forces.shape[2], quotients.controls.shape[2]
-        reading_count = self._at.output_count
+        reading_count = self._points.output_count
         # The series of one owner are contiguous in memory while they are added up. Forces come
         # first, then controls: their means over the steps, and their values at the beginnings.
         inputs = np.zeros((force_count + control_count, count, steps))
@@ -510,28 +516,28 @@ class TangentModel:
             forces = stepwise_inputs[:, :force_count].copy()
             # Changes of model parameters already contain their effect on readings.
             forces[:, :, self._find_parameter_changes(changes, count)] = 0.0
-            readings += np.matmul(quotients.read_forces[self._at.point_of_step], forces)
+            readings += np.matmul(quotients.read_forces[self._points.point_of_step], forces)
             instants = np.ascontiguousarray(instant_inputs.transpose(2, 0, 1))
-            readings += np.matmul(quotients.read_controls[self._at.point_of_step], instants)
+            readings += np.matmul(quotients.read_controls[self._points.point_of_step], instants)
         return stepwise_inputs, readings
 
     @property
     def point_of_step(self) -> IndexArray:
         """Index of the linearisation point whose quotients apply to each step, (S,)."""
-        return self._at.point_of_step
+        return self._points.point_of_step
 
     @property
     def hidden_state_effects(self) -> Sequence[int]:
         """Numbers of the effects with hidden states."""
-        return self._at.hidden_state_effects
+        return self._points.hidden_state_effects
 
     @property
     def motion_readings(self) -> Array:
         """Readings (S, O) of O outputs at the beginnings of S steps, as computed by the model."""
-        motion, points = self._motion, self._at.point_of_step
+        motion, points = self._motion, self._points.point_of_step
         # The model is evaluated at all steps instead of the linearisation points.
-        with self._at.at_steps(np.arange(self._steps)):
-            _, step_readings = self._at.compute_accelerations(self._at.acting)
+        with self._points.at_steps(np.arange(self._step_count)):
+            _, step_readings = self._points.compute_accelerations(self._points.acting)
         # The model was evaluated with the mean of a command over the step, while a sensor shows its
         # value at the beginning.
         difference = motion.instant - motion.controls
@@ -554,8 +560,8 @@ class TangentModel:
             (N, Z) exact minus computed state, of Z components, after a step from each of the N
             linearisation points.
         """
-        with self._at.with_batch(finer):
-            finer_state, _ = self._at.step_displaced({}, self._at.acting, steps=2)
+        with self._points.with_batch(finer):
+            finer_state, _ = self._points.step_displaced({}, self._points.acting, steps=2)
         state, _ = self._base_step
         return 2.0 * (finer_state - state)
 
@@ -598,14 +604,14 @@ class TangentModel:
         """
         if not np.array_equal(self._motion.controls, similar._motion.controls):
             return self.defects - similar.defects
-        ends = np.append(self._at.point_steps[1:], self._steps)
-        middle = (self._at.point_steps + ends) // 2
+        ends = np.append(self._points.point_steps[1:], self._step_count)
+        middle = (self._points.point_steps + ends) // 2
         # Evaluate these steps instead of the linearisation points.
-        with self._at.at_steps(middle):
-            states, _ = self._at.step_displaced({}, self._at.acting)
+        with self._points.at_steps(middle):
+            states, _ = self._points.step_displaced({}, self._points.acting)
         similar_states, _ = similar._every_step
         changes: Array = similar_states[middle] - states
-        return changes[self._at.point_of_step]
+        return changes[self._points.point_of_step]
 
     @property
     def limited_forces(self) -> Array:
@@ -616,19 +622,20 @@ class TangentModel:
     @cached_property
     def _every_step(self) -> tuple[Array, Array]:
         """States (S, Z) after each step, and the limited forces (S, K)."""
-        with self._at.at_steps(np.arange(self._steps)), self._at.limited_forces():
-            return self._at.step_displaced({}, self._at.acting)
+        with self._points.at_steps(np.arange(self._step_count)), self._points.limited_forces():
+            return self._points.step_displaced({}, self._points.acting)
 
     def _interpolate_to_steps(self, values: Array) -> Array:
         """Interpolate values (N, k) at N linearisation points linearly to all S steps, (S, k).
 
         A point lies at each change of a command and at regular distances after it. Between two
         points of one command the motion is smooth, so values are interpolated there; after the last
-        point of a command, they are extrapolated. `_earlier` and `_later` (S,) are the two points
-        for each step, and `_share` (S,) is its distance from its own point, as a share of theirs.
+        point of a command, they are extrapolated. `_earlier_point` and `_later_point` (S,) are the
+        two points for each step, and `_distance_share` (S,) is its distance from its own point, as
+        a share of their distance.
         """
-        slope = values[self._later] - values[self._earlier]
-        result: Array = values[self._at.point_of_step] + self._share[:, None] * slope
+        slope = values[self._later_point] - values[self._earlier_point]
+        result: Array = values[self._points.point_of_step] + self._distance_share[:, None] * slope
         return result
 
     @staticmethod

@@ -124,7 +124,7 @@ class XmlText:
         Its end is that of the start tag until the end tag is parsed.
         """
         tag = XmlElement(name, attributes, self._parser.CurrentByteIndex)
-        tag.inside = tag.end = self._end_of(tag.begin)
+        tag.inside = tag.end = self._find_end_of_tag(tag.begin)
         # Elements whose end tag has not been reached are open; the last one is the parent.
         if self._open:
             self._open[-1].children.append(tag)
@@ -142,7 +142,7 @@ class XmlText:
         """Return whether an element has a self-closing tag."""
         return self.text[tag.inside - 2 : tag.inside] == b"/>"
 
-    def _end_of(self, begin: int) -> int:
+    def _find_end_of_tag(self, begin: int) -> int:
         """Return the byte offset after a tag: after the first ``>`` that is not within quotes.
 
         Args:
@@ -188,7 +188,7 @@ class XmlText:
         return b"".join([*parts, self.text[offset:end]])
 
     def _find_end_of_element(self, tag: XmlElement) -> int:
-        return tag.inside if self._is_self_closing(tag) else self._end_of(tag.end)
+        return tag.inside if self._is_self_closing(tag) else self._find_end_of_tag(tag.end)
 
     def _render_element(self, tag: XmlElement) -> bytes:
         """Return the text of an element with its comments, changed attributes and new elements.

@@ -122,9 +122,9 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
     changed["says"] = f"{effect.says_at_place or effect.says} (at {effect_place.words})"
     changed["pairs"] = effect_place.pairs
     if issubclass(effect, Force):
-        changed["force"] = _force_of(effect)
+        changed["force"] = _make_force_method(effect)
     elif issubclass(effect, Friction):
-        changed["limit"] = _limit_of(effect)
+        changed["limit"] = _make_limit_method(effect)
     elif issubclass(effect, HiddenStateEffect):
         changed["act"] = _make_act_method(effect)
         # Coefficients: without those whose quantity the model file states.
@@ -152,7 +152,7 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
     )
 
 
-def _force_of(effect: type[Force]) -> Callable[[Force, Array, StateSnapshot], Array]:
+def _make_force_method(effect: type[Force]) -> Callable[[Force, Array, StateSnapshot], Array]:
     """Make the `force` method of an effect at one joint from that of the registered effect.
 
     The registered effect is written for a system with one coordinate. The new method passes it
@@ -196,12 +196,12 @@ def make_shared_effects(
     changed: dict[str, Any] = {
         "at": "world",
         "says": f"{effect.says} (of the common supply of all drives)",
-        "force": _force_of_all(effect, [cast(int, joint) for joint in joints]),
+        "force": _make_shared_force_method(effect, [cast(int, joint) for joint in joints]),
     }
     yield _create_placed_effect(effect, effect.name, "", coefficients, changed)
 
 
-def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., Array]:
+def _make_shared_force_method(effect: type[Force], joints: Sequence[int]) -> Callable[..., Array]:
     """Make the `force` method of an effect that all drives share, such as a supply that sags.
 
     The method evaluates the registered effect at each driven joint. There the effect depends on the
@@ -227,7 +227,7 @@ def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., A
     return force
 
 
-def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapshot], Array]:
+def _make_limit_method(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapshot], Array]:
     """Make the `limit` method of a dry friction at one joint from that of the registered effect.
 
     The registered effect is written for a system with one coordinate. The new method passes it the
