@@ -117,6 +117,8 @@ class FloatingJoints:
     def get_initial_state(self, states: Mapping[str, float]) -> FloatingState:
         """Return the initial pose (P,) and velocity (F,) of a run, with normalised quaternions.
 
+        The P entries and F velocities are those of all floating joints, in the order of `names`.
+
         Args:
             states: initial states by name, as in `names`.
 
@@ -143,7 +145,7 @@ class FloatingJoints:
         """Displace poses along one degree of freedom: add to a position, or rotate about an axis.
 
         Args:
-            pose: (n, P) poses.
+            pose: (n, P) n poses, P numbers each.
             number: index of the degree of freedom among the F velocities.
             displacement: displacement in m or rad; see `displace`.
 
@@ -156,6 +158,9 @@ class FloatingJoints:
 
     def displace(self, pose: Array, displacements: Array) -> Array:
         """Displace poses (n, P) by small displacements (n, F) in m and rad.
+
+        A pose has P numbers, positions and quaternions, and a displacement has F, as many as there
+        are velocities.
 
         The position p of a body becomes p + d_p, along the axes of the world. Its orientation, the
         quaternion q, becomes q exp(d_r / 2) with the rotation vector d_r in the axes of the body
@@ -175,6 +180,9 @@ class FloatingJoints:
 
     def compute_displacement(self, pose: Array, reference: Array) -> Array:
         """Compute the displacements (n, F) from reference poses (n, P) to other poses (n, P).
+
+        A pose has P numbers, positions and quaternions, and a displacement has F, as many as there
+        are velocities.
 
         A displacement has the difference of positions in m, and the rotation vector of
         q_reference^-1 q in rad, so that `displace` moves the reference pose to the other one.

@@ -134,7 +134,8 @@ def follow_measured_joints(
     Args:
         robot: model of the robot.
         step: time step in seconds.
-        positions: (S + 1, nq) positions of all joints at the steps, in the order of qpos.
+        positions: (S + 1, nq) positions of all joints at the beginnings of S steps and at the end,
+            in the order of qpos.
         velocities: (S + 1, nv) their velocities, in the order of qvel.
         unmeasured: names of the joints that are moved from their states in the first row.
 

@@ -349,7 +349,7 @@ def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         fields: model fields of L batch elements, changed in place.
         robot: robot with the joint.
         place: name of the joint.
-        c: (K, L) components of r in rad: all three, or only those that change the motion.
+        c: (K, L) the K components of r in rad: all three, or only those that change the motion.
     """
     joint_id = robot.joint(place).id
     # The n batch elements with a rotation; only their axes change.

@@ -194,14 +194,15 @@ class RobotSimulator(SystemSimulator):
         """Return the effects whose coefficients are not all zero, each at one place.
 
         Effects of free parameters of the model come first; then those that the simulator was
-        created with. A family, one effect at all places, is divided into its members.
+        created with. The base class takes the latter from the columns of `theta` after those of
+        the free parameters. A family, one effect at all places, is divided into its members.
 
         Args:
             theta: (L, P) P parameters of L batch elements: first the free ones, then coefficients
                 of effects.
 
         Returns:
-            Effects with their coefficients (K, L, 1).
+            Effects with K coefficients each, (K, L, 1).
         """
         effects: list[tuple[Effect, Array]] = []
         column = 0
@@ -221,7 +222,7 @@ class RobotSimulator(SystemSimulator):
         Shapes: L batch elements, K coefficients.
 
         Args:
-            theta: (L, p) parameters.
+            theta: (L, P) values of the P parameters.
 
         Returns:
             Effects with their coefficients (K, L, 1).
@@ -267,10 +268,10 @@ class RobotSimulator(SystemSimulator):
         beyond the end of a shorter run.
 
         Args:
-            acting: effects with coefficients (K, L, 1).
+            acting: effects with K coefficients each, (K, L, 1).
             runs: the distinct scenarios (runs), and the index of the scenario of each element.
             commands: values of each input, by name, of each distinct scenario.
-            x: (L, D) initial positions.
+            x: (L, D) initial positions of D joints.
             v: (L, D) initial velocities.
         """
         max_samples = max(s.times.size for s in runs.unique_scenarios)
@@ -348,7 +349,8 @@ class RobotSimulator(SystemSimulator):
             run_batches: batch elements of each run.
 
         Returns:
-            Poses (L, P) and velocities (L, F) of the L elements of all runs.
+            Poses (L, P) of P numbers and velocities (L, F) of F numbers, of the L elements of all
+            runs.
         """
         poses, rates = zip(*map(self.get_floating_start, run_batches), strict=True)
         sizes = [len(batch.x) for batch in run_batches]
@@ -507,7 +509,7 @@ class RobotSimulator(SystemSimulator):
 
         Args:
             activation_filter: filter: its actuator, time constant and kind.
-            controls: (n, S) controls over the steps.
+            controls: (n, S) controls of n batch elements over the steps.
             initial_activations: (n,) activations at the beginning.
 
         Returns:
@@ -535,7 +537,7 @@ class RobotSimulator(SystemSimulator):
         change masses, so MuJoCo derives constants from them again.
 
         Args:
-            acting: effects active in the motion, with coefficients (K, 1, 1).
+            acting: effects active in the motion, with K coefficients each, (K, 1, 1).
         """
         # One batch element makes one group.
         (added,) = group_by_added_elements(acting, 1)

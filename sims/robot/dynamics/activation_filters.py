@@ -72,7 +72,7 @@ class ActivationFilter(NamedTuple):
         integrator is Runge-Kutta 4, which agrees with it to fourth order.
 
         Args:
-            controls: (n, S) controls of the steps.
+            controls: (n, S) controls of n batch elements in the steps.
             initial: (n,) initial activations.
             step: step length h in seconds.
             is_rk4: whether the integrator is Runge-Kutta 4.

@@ -87,8 +87,10 @@ class StepEffects(NamedTuple):
     def from_active(cls, acting: ActiveEffects) -> StepEffects:
         """Select the effects that must be evaluated in every step, and sort them by their kind.
 
+        Each of them is of one of the three kinds: force, dry friction, or hidden state.
+
         Args:
-            acting: effects at one place each, with coefficients (K, L, 1).
+            acting: effects at one place each, with K coefficients for L batch elements, (K, L, 1).
         """
         selected = [(e, c) for e, c in acting if is_evaluated_per_step(e)]
         return cls(
@@ -131,7 +133,7 @@ def find_active_elements(
     An effect is active in an element if any of its coefficients is not zero there.
 
     Args:
-        acting: effects with their coefficients (K, L, 1).
+        acting: effects with K coefficients each, (K, L, 1).
         count: number L of batch elements.
         which: returns whether an effect is of this kind, such as `is_evaluated_per_step`.
 
@@ -164,7 +166,7 @@ def slice_active_effects(acting: ActiveEffects, batch_indices: IndexArray) -> Ac
 def pad_coefficients(acting: ActiveEffects, n: int, count: int) -> ActiveEffects:
     """Pad coefficients with zeros to the size of a batch.
 
-    Shapes: K coefficients.
+    Shapes: K coefficients of an effect, n batch elements in use.
 
     Args:
         acting: effects with their coefficients (K, n, 1).

@@ -42,7 +42,7 @@ def group_by_added_elements(acting: ActiveEffects, count: int) -> dict[AddedElem
     too, with the key ().
 
     Args:
-        acting: effects with their coefficients (K, L, 1).
+        acting: effects with K coefficients each, (K, L, 1).
         count: number L of batch elements.
 
     Returns:

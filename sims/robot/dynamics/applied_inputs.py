@@ -153,8 +153,8 @@ def compute_inputs_over_steps(
     Args:
         step: step length in seconds.
         scenario: scenario of the run.
-        commands: commanded inputs (T,) by name.
-        acting: active effects with their coefficients (K, n, 1).
+        commands: commanded inputs (T,) at T samples by name.
+        acting: active effects with K coefficients each, (K, n, 1).
         n: number of batch elements.
         steps: number S of steps.
         share: share of each step, from its beginning, over which the input is averaged. The default
@@ -215,7 +215,7 @@ def compute_changed_inputs(
         share: share of each step, from its beginning, over which the input is averaged.
 
     Yields:
-        Number of the run, name of the input, indices of some of the run's batch elements (L,), and
+        Number of the run, name of the input, indices (L,) of L of the run's batch elements, and
         their applied inputs (L, S) over S steps.
     """
     # 1. Collect one request for each input and group of batch elements with the same effects on it.
@@ -293,7 +293,8 @@ def _group_by_active_effects(
     """Group n batch elements by the effects that act on them, without elements on which none acts.
 
     Args:
-        input_effects: effects with coefficients (K, n, 1); one with zeros only does not act.
+        input_effects: effects with K coefficients each, (K, n, 1); one with zeros only does not
+            act.
         n: number of batch elements.
 
     Yields:
@@ -432,7 +433,7 @@ def compute_step_inputs(parts: Array, has_sample: Mask) -> Array:
     * With samples at both ends, nothing is added.
 
     Args:
-        parts: (n, S, 4) means over the quarters.
+        parts: (n, S, 4) means over the quarters of S steps, for n batch elements.
         has_sample: (S + 1,) whether a sample is at the beginning of the first step and at each step
             end.
     """

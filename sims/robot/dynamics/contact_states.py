@@ -90,7 +90,7 @@ class ContactModel:
 
         Args:
             simulator: simulator of the robot.
-            theta: (P,) parameters, of which effects have their coefficients.
+            theta: (P,) values of the P parameters, of which effects have their coefficients.
         """
         import mujoco
 
@@ -118,7 +118,7 @@ class ContactModel:
 
         Args:
             scenario: scenario of the run, whose first commands act.
-            x: (D,) initial positions of the joints, on which activations may depend.
+            x: (D,) initial positions of the D joints, on which activations may depend.
             v: (D,) initial velocities.
         """
         import mujoco
@@ -169,9 +169,9 @@ class ContactModel:
         """Return Jacobian (n, nv), distance in m, and whether it is closed, for each contact.
 
         The Jacobian maps the velocities (nv,) of the robot to that of the second geom against the
-        first one at the contact point, in the frame of the contact: along its normal (n = 1), and,
-        with friction, along two tangents (n = 3). A closed contact exerts a force. The key of a
-        contact is its two geoms, and its number among the contacts of these geoms.
+        first one at the contact point, in the frame of the contact: along its normal, and, with
+        friction, along two tangents (n components, 1 or 3). A closed contact exerts a force. The
+        key of a contact is its two geoms, and its number among the contacts of these geoms.
         """
         import mujoco
 
@@ -231,7 +231,7 @@ def settle_contacts(
     Args:
         model: the robot.
         scenario: scenario of the run, whose first commands act.
-        start: (D,) measured or smoothed positions and velocities.
+        start: (D,) measured or smoothed positions and velocities of D joints.
         sigma: (D,) standard deviations of a measurement of them.
         weights: (2 D, 2 D) W of (2), invertible; None if the errors of the start are independent
             with the standard deviations `sigma`. The readings of a whole run determine a velocity
@@ -311,7 +311,7 @@ def _differentiate(
         model: the robot.
         state: (2 D,) positions and velocities.
         contacts: contacts at this state.
-        residual: (m,) residual at this state.
+        residual: (m,) residual of m components at this state.
         keys: contacts that may be closed, which make up the residual.
     """
     jacobian = np.empty((residual.size, state.size))
@@ -328,12 +328,14 @@ def _differentiate(
 def _solve(jacobian: Array, residual: Array, offset: Array, weights: Array) -> Array:
     """Return the Gauss-Newton step (2 D,) for the sum of squares |offset|^2 + |residual|^2.
 
+    The state has the positions and velocities of D joints.
+
     It is a linear least-squares problem in the weighted step y = W dz: the offset becomes offset +
     y, and the residual becomes residual + J W^-1 y with the Jacobian J.
 
     Args:
         jacobian: (m, 2 D) derivatives of the residual.
-        residual: (m,) weighted residual of the contacts.
+        residual: (m,) weighted residual of the contacts, of m components.
         offset: (2 D,) W (z - z_m), the weighted distance of the state z from the measured one.
         weights: (2 D, 2 D) W, a square root of the inverse covariance of the measured state.
     """
@@ -348,6 +350,8 @@ def _compute_residual(
     contacts: dict[_Key, _Contact], reference: dict[_Key, _Contact], keys: list[_Key]
 ) -> npt.NDArray[np.float64]:
     """Return the residual (m,) of contact equilibrium, divided by its tolerances.
+
+    It has m components, two or more for each contact.
 
     A closed contact must have no normal velocity and no acceleration of its point. An open one must
     have no normal velocity and the depth `FIRST_DEPTH`, so that it closes.

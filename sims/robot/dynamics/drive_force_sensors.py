@@ -54,7 +54,8 @@ class DriveSensorModel:
         joint, the reading of that joint changes in proportion.
 
         Args:
-            readings: (n, S, k) sensor data of n batch elements in S steps; changed in place.
+            readings: (n, S, k) sensor data, k numbers of n batch elements in each of S steps;
+                changed in place.
         """
         batch_inputs, mujoco_batch = self.inputs, self.batch
         columns = mujoco_batch.drives  # column of the drive force in the sensor data, by joint
@@ -92,10 +93,11 @@ class DriveSensorModel:
         snapshot.
 
         Args:
-            readings: (n, S, k) sensor data of n batch elements in S steps; changed in place.
+            readings: (n, S, k) sensor data, k numbers of n batch elements in each of S steps;
+                changed in place.
             x: (n, S + 1, D) positions of the D joints.
             v: (n, S + 1, D) velocities.
-            acting: active effects with their coefficients (K, n, 1).
+            acting: active effects with K coefficients each, (K, n, 1).
         """
         # 1. Batch elements with such an effect, and their readings of all drives.
         batch_indices = np.flatnonzero(find_active_elements(acting, len(x), is_in_drive))

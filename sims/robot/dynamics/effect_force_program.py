@@ -148,7 +148,7 @@ class StepForces:
 
         Args:
             effect: effect in the batch.
-            c: (K, L, 1) its coefficients.
+            c: (K, L, 1) its K coefficients for L batch elements.
         """
         effects = StepEffects.from_active(((effect, c),))
         function = _make_function(self._system, tuple(self._applied_inputs), effects)
@@ -291,6 +291,8 @@ def _make_function(
 
         def evaluate() -> tuple[Any, Any, Any]:
             """Return forces and friction limits (L, D) at the middle of a step, and hidden states.
+
+            There are L batch elements and D joints.
 
             The H hidden states (L, 2 H) are those after the interval.
             """

@@ -61,7 +61,7 @@ def compute_time_dependent_forces(
 
     Args:
         system: system of the robot.
-        acting: active effects with their coefficients (K, L, 1).
+        acting: active effects with K coefficients each, (K, L, 1).
         t: (S,) beginnings of the steps in seconds; forces are evaluated half a step later.
         size: number D of coordinates.
         batch_size: number L of batch elements.

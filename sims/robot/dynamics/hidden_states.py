@@ -73,7 +73,7 @@ def integrate_state(
 
     Args:
         effect: effect at its place.
-        c: (K, 1, 1) coefficients of the effect.
+        c: (K, 1, 1) the K coefficients of the effect.
         snapshots: states of the robot at the middle of each of the S steps, stored as S batch
             elements.
         step: step length in seconds.

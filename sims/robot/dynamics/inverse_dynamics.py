@@ -41,7 +41,7 @@ def motion_forces(
     Args:
         model: compiled mujoco.MjModel.
         joints: J joints with one coordinate each.
-        motion: (3, T, J) positions, velocities and accelerations of the joints.
+        motion: (3, T, J) positions, velocities and accelerations of the joints at T times.
         controls: (T, nu) controls of all actuators.
         activations: (T, na) activations of all actuators; zero if None.
 

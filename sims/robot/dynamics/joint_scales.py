@@ -91,7 +91,7 @@ def compute_joint_scales(robot: RobotModel) -> JointScales:
 
 
 def coefficient_scales(robot: RobotModel) -> JointScales:
-    """Compute the forces and inertias of each joint (D,) that set the ranges of coefficients.
+    """Compute the forces and inertias (D,) of D joints that set the ranges of coefficients.
 
     The values are those of `compute_joint_scales`, but at least `MIN_PARENT_SHARE` times those of
     the parent joint of the same kind: for a hinge, the next hinge towards the base, for a slide the
@@ -122,7 +122,7 @@ def compute_floating_forces(robot: RobotModel) -> Array:
     """Compute the typical force of each degree of freedom of floating bodies, in N or N m.
 
     Returns:
-        (F,) forces for the acceleration `TYPICAL_ACCELERATION`.
+        (F,) forces of F degrees of freedom for the acceleration `TYPICAL_ACCELERATION`.
     """
     inertias = np.diagonal(inertia_matrix(robot.compiled))
     result: Array = TYPICAL_ACCELERATION * inertias[FloatingJoints.from_robot(robot).velocities]

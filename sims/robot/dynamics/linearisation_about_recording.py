@@ -127,9 +127,9 @@ class MeasuredLinear(RunLinearisation):
 
         Args:
             simulator: simulator of the robot.
-            theta: (P,) parameters of the simulator.
+            theta: (P,) values of the P parameters of the simulator.
             scenario: scenario of the run, with its T sample times.
-            start: (D,) positions and velocities at which the simulated motion begins.
+            start: (D,) positions and velocities of D joints at which the simulated motion begins.
             trajectory: given motion at all steps.
             measured: alternative to `trajectory`: (T, 3) position, velocity and acceleration at the
                 T samples, by joint number; all other joints follow the simulation.
@@ -439,8 +439,9 @@ class MeasuredLinear(RunLinearisation):
         intervals at once, instead of one interval after the other.
 
         Returns:
-            For the first, second, ... step in an interval: the numbers (k,) of these steps in the
-            run, and the numbers (k,) of the intervals that are long enough to have it.
+            For the first, second, ... step in an interval: the numbers of these steps in the run,
+            and the numbers of the intervals that are long enough to have it, as arrays of one
+            length.
         """
         lengths = np.diff(self.knots)  # numbers of steps
         first_steps = self.knots[:-1]
@@ -464,8 +465,8 @@ class MeasuredLinear(RunLinearisation):
 
         Args:
             effects: K effects with their coefficients; those in series with a joint add nothing.
-            predicted: (T, Z) deviations δ at the T samples, each predicted from the preceding
-                samples.
+            predicted: (T, Z) deviations δ of Z state components at the T samples, each predicted
+                from the preceding samples.
             driven: changes of the controls by effects on inputs, by index of the effect; computed
                 if None.
 
@@ -520,6 +521,8 @@ class MeasuredLinear(RunLinearisation):
     def _input_responses(self) -> Array:
         """State changes (T - 1, Z, E + nu) at the end of each interval between T samples.
 
+        A state has Z components.
+
         They are per unit of one of E generalised forces or nu controls that is constant over the
         interval.
         """
@@ -530,7 +533,7 @@ class MeasuredLinear(RunLinearisation):
     def _compute_direct_readings(
         self, readings: Array, sensors: Sequence[ActiveEffects], predicted: Array
     ) -> Array:
-        """Compute the direct changes ψ (T, C, K) of readings by K candidate effects.
+        """Compute the direct changes ψ (T, C, K) of C channels by K candidate effects.
 
         They do not pass through the motion; an example is the bias of a sensor. The candidates are:
 
@@ -544,7 +547,8 @@ class MeasuredLinear(RunLinearisation):
             readings: (S, O, K) direct changes of O readings by effects in the model, in each of S
                 steps.
             sensors: sensor effects of each of the K candidates.
-            predicted: (T, Z) deviations of the predicted motion from the given one at T samples.
+            predicted: (T, Z) deviations of Z state components of the predicted motion from the
+                given one at T samples.
         """
         direct_changes = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
         changing = [k for k, acting in enumerate(sensors) if acting or readings[:, :, k].any()]
@@ -611,9 +615,9 @@ class MeasuredLinear(RunLinearisation):
         """Return the motion plus deviations of its states, such as those of a smoother.
 
         Args:
-            deviations: (S + 1, Z) deviations at the beginnings of the S steps and at the end. The
-                columns are positions and velocities of the joints, activations, hidden states of
-                effects, and displacements and velocities of floating bodies.
+            deviations: (S + 1, Z) deviations of Z state components at the beginnings of the S steps
+                and at the end. The columns are positions and velocities of the joints, activations,
+                hidden states of effects, and displacements and velocities of floating bodies.
 
         Returns:
             The motion of the file's joints and of floating bodies; other deviations are ignored.
@@ -678,12 +682,12 @@ def interpolate_quintic(times: Array, samples: Array, instants: Array) -> tuple[
     the slope there, since a motion has one step more than its run.
 
     Args:
-        times: (T,) sample times, ascending.
+        times: (T,) times of T samples, ascending.
         samples: (T, 3) values, first and second derivatives.
         instants: (n,) times at which to interpolate.
 
     Returns:
-        Values and first derivatives (n,).
+        Values and first derivatives, (n,) each, at the n times.
     """
     within = np.clip(instants, times[0], times[-1])
     # Index of the last sample before each instant; the last sample belongs to the last interval.

@@ -72,9 +72,9 @@ class RunLinearisation:
 
         Args:
             simulator: simulator of the robot.
-            theta: (dim,) parameters.
+            theta: (P,) values of the P parameters.
             scenario: scenario of the run.
-            x: (D,) initial positions.
+            x: (D,) initial positions of D joints.
             v: (D,) initial velocities.
         """
         assert isinstance(simulator, RobotSimulator), "a robot"
@@ -114,7 +114,7 @@ class RunLinearisation:
 
         One more step is added, so that the state at the run's end is the beginning of a step like
         all others. The motion includes the forces on both sides of the transmissions, on which some
-        effects depend. The sensors' readings (S,) at the beginnings of the steps are stored in
+        effects depend. The sensors' readings (S,) at the beginnings of the S steps are stored in
         `_readings`, by channel.
         """
         simulator = self._simulator
@@ -175,7 +175,7 @@ class RunLinearisation:
             fields: recorded `qpos` and `qvel` after each step, (1, S, ...).
 
         Returns:
-            Poses (S + 1, P) and velocities (S + 1, F).
+            Poses (S + 1, P) of P numbers and velocities (S + 1, F) of F numbers, over S steps.
         """
         start = self._simulator.get_floating_start(self._run_batch)
         floating = self._simulator.make_linearisation_batch(self._run_batch.acting).floating
@@ -311,7 +311,8 @@ class RunLinearisation:
 
         All are simulated in one batch, in which each element has the effects of the run and one
         more. An added effect that contains a simpler one of the run, as Stribeck friction contains
-        Coulomb friction, takes its coefficient over and replaces it.
+        Coulomb friction, takes its coefficient over and replaces it. The result has T samples of C
+        channels.
         """
         count, run = len(added), self._run_batch
         # Coefficients (k, K, 1) of the effects of the run, in all elements.
@@ -362,7 +363,7 @@ class RunLinearisation:
         Args:
             owner: number of the candidate to which the perturbations belong.
             effect: effect at one place.
-            c: (K, 1, 1) its coefficients.
+            c: (K, 1, 1) its K coefficients.
         """
         # Name of the registered effect, without a place; index of its joint, or None.
         name = effect.of or effect.name
@@ -415,8 +416,8 @@ class RunLinearisation:
         effect, its coefficients are replaced in that element.
 
         Args:
-            input_effects: the further effect of each of the n batch elements, with its coefficients
-                (K, 1, 1).
+            input_effects: the further effect of each of the n batch elements, with its K
+                coefficients, (K, 1, 1).
         """
         count = len(input_effects)
         # Effects by name, with coefficients (K, n, 1): those of the run in all elements, then one
@@ -560,7 +561,7 @@ def _select_sensor_effects(
 
     Args:
         channel: name of the channel.
-        run_effects: effects that are active in the run, with coefficients (K, L, 1).
+        run_effects: effects that are active in the run, with K coefficients each, (K, L, 1).
         extra_effects: additional effects of each of the L batch elements, with coefficients
             (K, 1, 1).
 

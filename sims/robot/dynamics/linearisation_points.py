@@ -123,7 +123,7 @@ class LinearisationPoints:
             mujoco_batch: batch of the robot; its size is the number of points evaluated together.
             system: system of the robot.
             motion: motion at all steps: states, controls and forces.
-            acting: effects active in it, with coefficients (K, 1, 1).
+            acting: effects active in it, with K coefficients each, (K, 1, 1).
             outputs: fields of MuJoCo's data and their columns that are read, in addition to the
                 state.
             joints: addresses of the joints.
@@ -248,10 +248,10 @@ class LinearisationPoints:
             steps: number of steps, for a batch with shorter ones.
 
         Returns:
-            States (N, Z) after the step, and readings (N, O) of the outputs. A state consists of
-            the positions and velocities of joints, activations, hidden states of effects, and
-            displacements and velocities of floating bodies; displacements are relative to the
-            motion after the step.
+            States (N, Z) of Z components after the step, and readings (N, O) of the O outputs. A
+            state consists of the positions and velocities of joints, activations, hidden states of
+            effects, and displacements and velocities of floating bodies; displacements are relative
+            to the motion after the step.
         """
         states, readings = [], []
         # `bind` returns a field of MuJoCo's data, with one row for each batch element.
@@ -295,15 +295,15 @@ class LinearisationPoints:
 
         Args:
             acting: effects whose elements are in the model.
-            extra_forces: (N, E) additional forces on all joints and floating bodies; none by
-                default.
+            extra_forces: (N, E) additional forces on the E velocities of joints and floating
+                bodies; none by default.
             moved: index and size of a displacement by its quantity: ``{"q": (2, 1e-6)}`` moves
                 joint 2. The quantities are those of `_place_points`. None by default.
             at_centres: whether joints have the state in the middle of the steps that a point stands
                 for, instead of that at the point.
 
         Returns:
-            Accelerations (N, E) of all joints and floating bodies, and readings (N, O) of the
+            Accelerations (N, E) of all joints and floating bodies, and readings (N, O) of the O
             outputs.
         """
         accelerations, readings = [], []
@@ -486,7 +486,7 @@ class LinearisationPoints:
 
         Args:
             steps: (n,) the steps.
-            x: (n, D) positions.
+            x: (n, D) positions of D joints.
             v: (n, D) velocities.
             carried: (2, n, D) forces on both sides of the transmissions.
         """
@@ -520,7 +520,7 @@ class LinearisationPoints:
 
     @contextmanager
     def at_steps(self, steps: IndexArray) -> Iterator[None]:
-        """Evaluate other steps of the motion (n,) within a `with` block, instead of the points."""
+        """Evaluate the given steps of the motion within a `with` block, instead of the points."""
         previous = self.point_steps
         self.point_steps = steps
         try:
@@ -582,7 +582,7 @@ class LinearisationPoints:
 
         Args:
             effect: effect in a drive.
-            c: coefficients (K, 1, 1).
+            c: (K, 1, 1) its K coefficients.
             readings: (N, O) readings of the O outputs without the effect.
         """
         # Outputs that are no drive forces have the joint -1.
@@ -609,7 +609,7 @@ class LinearisationPoints:
 
         Args:
             effect: effect with a force, a friction or a hidden state.
-            c: coefficients (K, 1, 1).
+            c: (K, 1, 1) its K coefficients.
         """
         # Each step is one batch element of the snapshot, all with the same coefficients.
         coefficients = np.repeat(c, len(self.motion.controls), axis=1)
@@ -663,7 +663,7 @@ class LinearisationPoints:
 
         Args:
             effect: effect at its place.
-            c: (K, 1, 1) its coefficients.
+            c: (K, 1, 1) its K coefficients.
 
         Returns:
             Hidden states (S + 1, 1) at the beginnings of the S steps and at the end; empty if the

@@ -98,7 +98,7 @@ class MidpointPredictor:
 
         Args:
             batch: the mujoco.batch.Batch.
-            positions: (D,) addresses of the joints' positions.
+            positions: (D,) addresses of the positions of D joints.
             velocities: (D,) addresses of the joints' velocities.
             loaded: (L,) whether the load of transmissions matters; L is the number of elements in
                 use.
@@ -122,8 +122,8 @@ class MidpointPredictor:
         """Return the joint states at the beginning of the next step; called once for each step.
 
         Args:
-            has_new_command: (L,) whether commands have changed since the previous step; they are
-                already set.
+            has_new_command: (L,) whether commands of the L batch elements have changed since the
+                previous step; they are already set.
         """
         x, v, a, drive, bias = (field[:, indices] for field, indices in self._fields)
         # The initial acceleration lacks the applied forces, so it is not used for prediction.
@@ -141,13 +141,13 @@ class MidpointPredictor:
     ) -> tuple[Array, Array]:
         """Return the transmission loads (2, L, D) at the beginning and at the middle of a step.
 
-        The two loads of a joint are the drive's force, and the bias force of gravity and motion.
-        With the load d_k at the beginning of step k, that at its middle is extrapolated from the
-        change over the previous step: d_k + (d_{k-1, end} - d_{k-1}) / 2 (2). Both loads of the
-        difference have the same command, so that a jump with a command appears in d_k alone. MuJoCo
-        must evaluate the forces again with a new command. For integrators whose last evaluation is
-        at the beginning of a step, it must always do so, d_{k-1, end} is not known, and both
-        results are d_k.
+        The two loads of each of D joints, in L batch elements, are the drive's force, and the bias
+        force of gravity and motion. With the load d_k at the beginning of step k, that at its
+        middle is extrapolated from the change over the previous step: d_k + (d_{k-1, end} -
+        d_{k-1}) / 2 (2). Both loads of the difference have the same command, so that a jump with a
+        command appears in d_k alone. MuJoCo must evaluate the forces again with a new command. For
+        integrators whose last evaluation is at the beginning of a step, it must always do so,
+        d_{k-1, end} is not known, and both results are d_k.
 
         Args:
             has_new_command: (L,) whether the command changes at the beginning of the step.
@@ -190,8 +190,9 @@ def forces_are_at_step_end(model: Any) -> bool:
 def compute_midpoint_loads(end_loads: Array, controls: Array) -> Array:
     """Compute transmission loads (2, S, D) at the middle of every step of a known motion.
 
-    It is the load at the end of the step minus half its growth over the step. The two loads are
-    those on both sides of a transmission: the drive's force, and that of gravity and motion.
+    It is the load at the end of the step minus half its growth over the step. The two loads of each
+    of D joints are those on both sides of a transmission: the drive's force, and that of gravity
+    and motion.
 
     Args:
         end_loads: (2, S, D) loads at the ends of the S steps, each with the command of its step.

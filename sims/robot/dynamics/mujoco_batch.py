@@ -275,7 +275,7 @@ class MujocoBatch:
         3. Let MuJoCo recompute the constants that it derives from the changed fields.
 
         Args:
-            acting: effects with coefficients (K, N, 1) for the N batch elements.
+            acting: effects with K coefficients for each of the N batch elements, (K, N, 1).
         """
         written_effects = tuple((effect.name, c.tobytes()) for effect, c in acting)
         if written_effects == self._written_effects:
@@ -359,7 +359,7 @@ class MujocoBatch:
         flexible gear. So they rest at the equilibrium of the links while the drives are held.
 
         Args:
-            positions: (n, D) positions of the joints of the file.
+            positions: (n, D) positions of the D joints of the file.
             velocities: (n, D) velocities of the joints of the file.
             floating_state: poses and velocities of floating bodies.
 
@@ -424,7 +424,7 @@ class MujocoBatch:
             controls: (n, S, nu) controls.
             forces: (n, S, nv) generalised forces.
             record: fields of MuJoCo's data to record.
-            off: (n, S, K) whether each actuator is switched off; none is by default.
+            off: (n, S, K) whether each of K actuators is switched off; none is by default.
             before_call: called with the number of the first step of each call of MuJoCo; it may
                 change `forces` of the steps that follow, as a callback may.
             steps_per_call: number of steps in one call of MuJoCo; as many as can be interrupted
@@ -472,7 +472,7 @@ class MujocoBatch:
 
         Args:
             steps: number S of steps.
-            off: (n, S, K) which of the K actuators are off; None if all are on.
+            off: (n, S, K) which of the K actuators are off in n batch elements; None if all are on.
             steps_per_call: maximum number of steps in a part.
         """
         ranges = None
@@ -500,8 +500,9 @@ class MujocoBatch:
             joints: addresses of D joints.
 
         Returns:
-            (N, D) stiffness, the force on the joint per unit of the set point's error; zero for
-            joints without a position servo. Several servos at one joint are added up.
+            (N, D) stiffness in all N batch elements, the force on the joint per unit of the set
+            point's error; zero for joints without a position servo. Several servos at one joint are
+            added up.
         """
         robot = self.robot
         stiffness = np.zeros((self.count, len(joints.velocities)))

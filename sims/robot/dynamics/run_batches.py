@@ -213,7 +213,7 @@ def split_into_batches(
     once for each batch. The batches of a group are of nearly equal size.
 
     Args:
-        acting: active effects, with coefficients (K, L, 1).
+        acting: active effects with K coefficients each, (K, L, 1).
         runs: runs (scenarios), and the number of the run of each of the L elements.
         max_size: maximum number of elements of a batch.
     """
@@ -230,7 +230,7 @@ def group_batch_elements(acting: ActiveEffects, count: int) -> Iterator[IndexArr
     MuJoCo derives; and the forces of all or none are evaluated in every step.
 
     Args:
-        acting: active effects, with coefficients (K, L, 1).
+        acting: active effects with K coefficients each, (K, L, 1).
         count: number L of batch elements.
     """
     # For each of the L elements, whether it has such an effect.

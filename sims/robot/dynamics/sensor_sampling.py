@@ -38,8 +38,8 @@ def sample_readings(
     2. Where a filter acts, replace them by samples of the filtered signal.
     3. Change each reading (effects such as a bias or a gain).
 
-    Shapes: L batch elements, S steps, T samples. Effects have coefficients (K, L, 1), and are
-    inactive in batch elements where all K of them are zero.
+    Shapes: L batch elements, S steps, T samples. Effects have K coefficients each, (K, L, 1), and
+    are inactive in batch elements where all of them are zero.
 
     Args:
         values: (L, S + 1) values at the start and at the end of each step.
@@ -118,7 +118,7 @@ def find_sample_steps(step: float, times: Array, count: int) -> NDArray[np.intp]
 
     Args:
         step: step length in seconds.
-        times: (T,) sample times in seconds since the start.
+        times: (T,) times of T samples in seconds since the start.
         count: number of step ends, including the start.
 
     Returns:
@@ -140,10 +140,11 @@ def _select_active_filters(sensors: ActiveEffects) -> tuple[NDArray[np.intp], Ac
     """Return the batch elements with an active filter, and the filters restricted to them.
 
     Args:
-        sensors: sensor effects with coefficients (K, L, 1); those that filter nothing are ignored.
+        sensors: sensor effects with K coefficients for L batch elements, (K, L, 1); those that
+            filter nothing are ignored.
 
     Returns:
-        Indices (n,) of the batch elements, and the filters with coefficients (K, n, 1).
+        Indices (n,) of the n batch elements, and the filters with coefficients (K, n, 1).
     """
     filters = tuple((e, c) for e, c in sensors if needs_every_step(e))
     if not filters:

@@ -187,7 +187,8 @@ def write_series_effects(
     Args:
         fields: model fields of the batch elements.
         robot: robot of `add_series_joints`.
-        acting: effects with coefficients (K, L, 1) for L batch elements; other effects are ignored.
+        acting: effects with K coefficients for each of L batch elements, (K, L, 1); other effects
+            are ignored.
     """
     elements_by_joint: dict[str, list[SeriesElement]] = {}
     for effect, c in acting:
@@ -366,7 +367,7 @@ def _limit_to_stable_values(
     * A spring of a joint keeps its stiffness, and gets more damping in its place.
 
     Args:
-        elements: elements (L,) in series; their damping is a damping ratio.
+        elements: elements in series of L batch elements; their damping is a damping ratio.
         inertia: inertia of the joint in kg m^2 or kg.
         drive: (L,) inertia of the drive in the same unit.
         step: time step in seconds.

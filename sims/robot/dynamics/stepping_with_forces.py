@@ -68,7 +68,7 @@ def step_with_forces(
         forces: (n, S, nv) generalised forces.
         step_forces: effects to evaluate.
         record: fields of MuJoCo's data to record.
-        off: (n, S, K) whether each actuator is switched off.
+        off: (n, S, K) whether each of K actuators is switched off.
 
     Returns:
         Recorded fields (n, S, ...) by name.
@@ -159,7 +159,8 @@ class _CallbackContexts:
         Args:
             mujoco_batch: the batch.
             step_forces: effects, with the hidden states of the beginning.
-            losses: (n, D) dry friction of the model at the D joints without effects.
+            losses: (n, D) dry friction of the model at the D joints without effects, for n batch
+                elements.
             steps: number of steps S.
         """
         self._mujoco_batch = mujoco_batch
@@ -260,7 +261,8 @@ class _CallbackContexts:
         """Set the previous accelerations of all batch elements before a call of MuJoCo.
 
         The callback predicts the middle of a step with the acceleration of the previous one. MuJoCo
-        may not keep it between two calls, so it is copied to the registers here.
+        may not keep it between two calls, so it is copied to the registers here, an array
+        (registers, 1) for each batch element.
 
         Args:
             first: number of the first step of the call. Before step 0 the acceleration is set to

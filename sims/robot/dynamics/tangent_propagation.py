@@ -388,7 +388,7 @@ class TangentModel:
         Args:
             owner: number of the effect candidate.
             effect: effect with a force.
-            c: coefficients (K, 1, 1).
+            c: (K, 1, 1) its K coefficients.
         """
         # Forces (S, D) on D joints along the motion of S steps.
         forces = self._points.compute_effect_force(effect, c)
@@ -628,7 +628,7 @@ class TangentModel:
     def _interpolate_to_steps(self, values: Array) -> Array:
         """Interpolate values (N, k) at N linearisation points linearly to all S steps, (S, k).
 
-        A point lies at each change of a command and at regular distances after it. Between two
+        Each point has k values. A point lies at each change of a command and at regular distances after it. Between two
         points of one command the motion is smooth, so values are interpolated there; after the last
         point of a command, they are extrapolated. `_earlier_point` and `_later_point` (S,) are the
         two points for each step, and `_distance_share` (S,) is its distance from its own point, as
@@ -649,8 +649,8 @@ class TangentModel:
         """Compute the responses to unit changes of each initial position and velocity of a joint.
 
         Returns:
-            Changes of states (2 D, S + 1, Z) and of readings (2 D, S, O) over S steps: first by the
-            D positions, then by the D velocities.
+            Changes of states (2 D, S + 1, Z) of Z components and of O readings (2 D, S, O) over S
+            steps: first by the D positions, then by the D velocities.
         """
         count = 2 * self._motion.x.shape[1]
         return self.propagate((), count, np.eye(self.state_size, count))
@@ -669,7 +669,7 @@ def compute_runge_kutta_step(
     Args:
         by_state: (N, D, 2 D) derivatives of accelerations of D joints by positions and velocities,
             at N points.
-        by_force: (N, D, E) derivatives by forces.
+        by_force: (N, D, E) derivatives by E forces.
         by_control: (N, D, nu) derivatives by controls.
         step: step length h in seconds.
 
@@ -697,7 +697,7 @@ def _find_neighbours(point_steps: IndexArray, spacing: int) -> IndexArray:
     one. If neither exists, it forms a pair with itself.
 
     Args:
-        point_steps: (N,) steps of the linearisation points.
+        point_steps: (N,) steps of the N linearisation points.
         spacing: regular number of steps between two points.
 
     Returns:

@@ -372,7 +372,7 @@ def _gather_lists(values: Integers, first_indices: Integers, sizes: Integers) ->
 
     Args:
         values: flat array that contains the lists.
-        first_indices: (n,) index of the first entry of each list.
+        first_indices: (n,) index of the first entry of each of n lists.
         sizes: (n,) number of its entries.
     """
     list_ends = np.cumsum(sizes)

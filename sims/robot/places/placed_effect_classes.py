@@ -160,7 +160,10 @@ def _make_force_method(effect: type[Force]) -> Callable[[Force, Array, StateSnap
     """
 
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
-        """Compute the forces (L, D), which are zero at all joints but that of the effect."""
+        """Compute the forces (L, D), which are zero at all joints but that of the effect.
+
+        There are L batch elements and D joints.
+        """
         joint = cast(int, self.coordinate)
         joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
         result = np.zeros_like(moment.x)
@@ -213,7 +216,10 @@ def _make_shared_force_method(effect: type[Force], joints: Sequence[int]) -> Cal
     """
 
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
-        """Compute the forces (L, D) along all driven joints from the total load of the supply."""
+        """Compute the forces (L, D) along all driven joints from the total load of the supply.
+
+        There are L batch elements and D joints.
+        """
         robot = cast(RobotSnapshot, moment)
         # Forces (L, D) of the drives, the first of both loads of the transmissions.
         drive_forces, _ = robot.carried
@@ -303,7 +309,10 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
     def act(
         self: HiddenStateEffect, c: Array, moment: StateSnapshot, state: HiddenState
     ) -> tuple[Array, Array]:
-        """Compute the forces (L, D), zero at other joints, and the rate of the hidden state."""
+        """Compute the forces (L, D), zero at other joints, and the rate of the hidden state.
+
+        There are L batch elements and D joints.
+        """
         joint = cast(int, self.coordinate)
         joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
         forces = np.zeros_like(moment.x)
