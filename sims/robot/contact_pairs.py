@@ -62,6 +62,9 @@ def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         pair: names of both geoms, joined by `PAIR_SEPARATOR`.
 
+    Returns:
+        Numbers of the geoms in the compiled model, in the order of their names in `pair`.
+
     Raises:
         InputError: there are no such geoms; the message lists the existing ones.
     """
@@ -171,6 +174,9 @@ def read_contact_parameters(robot: RobotModel, pair: str) -> tuple[float, Array]
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         pair: names of both geoms, joined by `PAIR_SEPARATOR`.
+
+    Returns:
+        The friction coefficient, and `solref` (2,).
     """
     geoms = find_pair_geoms(robot, pair)
     if has_pair(robot, geoms):

@@ -59,6 +59,12 @@ def list_coupling_places(robot: RobotModel) -> tuple[str, ...]:
 
     Such a joint is a hinge or slide with an actuator. The preceding joint is the next one towards
     the base; it must be of the same kind.
+
+    Args:
+        robot: robot as read from its model file.
+
+    Returns:
+        Names of the joints, in the order of the robot's joints.
     """
     driven_joints = {actuator.joint for actuator in robot.actuators}
     return tuple(

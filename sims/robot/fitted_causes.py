@@ -112,6 +112,10 @@ def _format_estimate(number: FittedValue) -> str:
 
     The parts are the fitted change, its confidence interval if it is known, and the number in the
     model file before and after the change if the file has one.
+
+    Args:
+        number: fitted change with its interval, and the number of the file before (`stated`) and
+            after (`total`).
     """
     text = append_unit(f"{number.value:.4g}", number.unit)
     if number.low is not None and number.high is not None:

@@ -88,6 +88,9 @@ class FloatingJoints:
         """Return the names of the pose entries (P), and those of the velocities (F).
 
         Examples are ``q.base.qw`` and ``qd.base.wx``.
+
+        Returns:
+            Names in the order of the addresses of all floating joints.
         """
         names = list(self.units())
         return (
@@ -100,6 +103,10 @@ class FloatingJoints:
 
         Positions are in m and velocities in m/s along the world's axes; quaternions have the unit
         1, and angular velocities rad/s.
+
+        Returns:
+            Units by name, such as ``q.base.x``: those of all positions and velocities of a joint,
+            joint after joint.
         """
         return {
             name: unit
@@ -165,6 +172,13 @@ class FloatingJoints:
         The position p of a body becomes p + d_p, along the axes of the world. Its orientation, the
         quaternion q, becomes q exp(d_r / 2) with the rotation vector d_r in the axes of the body
         (1). Moving for one second with the velocities (d_p, d_r) has this result in MuJoCo.
+
+        Args:
+            pose: (n, P) poses.
+            displacements: (n, F) displacements in m and rad.
+
+        Returns:
+            Displaced poses (n, P).
         """
         import mujoco
 
@@ -186,6 +200,13 @@ class FloatingJoints:
 
         A displacement has the difference of positions in m, and the rotation vector of
         q_reference^-1 q in rad, so that `displace` moves the reference pose to the other one.
+
+        Args:
+            pose: (n, P) poses at the end.
+            reference: (n, P) poses at the beginning.
+
+        Returns:
+            Displacements (n, F) in m and rad.
         """
         import mujoco
 
@@ -208,6 +229,9 @@ def list_state_units(joint: Joint) -> tuple[dict[str, str], dict[str, str]]:
 
     Args:
         joint: joint of any kind.
+
+    Returns:
+        Units by name of the positions, and by name of the velocities.
     """
     if joint.has_one_coordinate:
         return {f"q.{joint.name}": joint.unit}, {f"qd.{joint.name}": f"{joint.unit}/s"}

@@ -49,6 +49,9 @@ def compute_principal_axes(tensors: Array) -> tuple[Array, Array]:
 
     Shapes: L batch elements.
 
+    Args:
+        tensors: (L, 3, 3) symmetric tensors in kg m^2.
+
     Returns:
         The moments in ascending order, and the axes as unit quaternions (L, 4), w first.
     """

@@ -166,6 +166,9 @@ def specifies_integrator(robot: RobotModel) -> bool:
     An MJCF always does, since values that it omits are MuJoCo's defaults. A URDF describes the
     robot alone, unless it contains options of MuJoCo other than the defaults, or the table
     ``[engine]`` of the recording states them.
+
+    Args:
+        robot: robot as read from its model file.
     """
     # The table [engine] of the recording.
     is_stated = bool({"timestep", "integrator"} & set(robot.engine_table))

@@ -216,7 +216,14 @@ def _make_adding_writer(find: Find) -> FieldWriter:
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-        """Add coefficients c (K, L) to the fields of L batch elements, in place."""
+        """Add coefficients c (K, L) to the fields of L batch elements, in place.
+
+        Args:
+            fields: model fields by name.
+            robot: robot of the batch.
+            place: name of the joint, body or actuator.
+            c: coefficients, one row for each.
+        """
         for (element, *_), coefficient in zip(find(robot, place), c, strict=True):
             view = _view_element(fields, element)
             view[...] = add_to_file_value(view, coefficient)
@@ -234,7 +241,14 @@ def _make_scaling_writer(find: Find) -> FieldWriter:
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-        """Scale the fields of L batch elements in place by the coefficient c (1, L)."""
+        """Scale the fields of L batch elements in place by the coefficient c (1, L).
+
+        Args:
+            fields: model fields by name.
+            robot: robot of the batch.
+            place: name of the joint, body or actuator.
+            c: coefficients, one row for each.
+        """
         (elements,) = find(robot, place)
         for element in elements:
             view = _view_element(fields, element)
@@ -255,7 +269,14 @@ def _make_shifting_writer(find: Find) -> FieldWriter:
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-        """Add coefficients c (K, L) to the fields of L batch elements, in place."""
+        """Add coefficients c (K, L) to the fields of L batch elements, in place.
+
+        Args:
+            fields: model fields by name.
+            robot: robot of the batch.
+            place: name of the joint, body or actuator.
+            c: coefficients, one row for each.
+        """
         for (element, *_), coefficient in zip(find(robot, place), c, strict=True):
             _view_element(fields, element)[...] += coefficient
 
@@ -502,7 +523,14 @@ def _make_solref_writer(index: int) -> FieldWriter:
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-        """Scale the parameters of the pair of geoms `place`, by c (1, L) for L batch elements."""
+        """Scale the parameters of the pair of geoms `place`, by c (1, L) for L batch elements.
+
+        Args:
+            fields: model fields by name.
+            robot: robot with the pair.
+            place: name of the pair.
+            c: (1, L) coefficient.
+        """
         solref, factor = fields["pair_solref"][:, find_pair(robot, place)], compute_factor(c[0])
         is_direct = solref[:, 0] <= 0  # stiffness and damping, (L,)
         solref[~is_direct, index] *= factor[~is_direct]

@@ -95,6 +95,12 @@ def _strip_model(robot: RobotModel) -> RobotModel:
     3. Compare the smaller model with the whole one: fields that matter, and contacts in random
        poses. If anything differs, return the robot itself.
 
+    Args:
+        robot: robot as read from its model file.
+
+    Returns:
+        The robot with the smaller spec; the robot itself if any of the compared numbers differs.
+
     Raises:
         ValueError: MuJoCo rejects the smaller model.
     """

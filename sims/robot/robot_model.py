@@ -399,7 +399,11 @@ class RobotModel:
         return tuple(rows)
 
     def _get_sensor_unit(self, sensor: int) -> str:
-        """Return the SI unit of a sensor by its number; ``1`` if the type does not determine it."""
+        """Return the SI unit of a sensor by its number; ``1`` if the type does not determine it.
+
+        Args:
+            sensor: number of the sensor in the compiled model.
+        """
         import mujoco
 
         model, sensor_types = self.compiled, mujoco.mjtSensor
@@ -466,6 +470,9 @@ def cache_per_robot(
 
     The results are freed with the robot. A cache of the module would hold every model that a
     process has read.
+
+    Args:
+        function: function whose first argument is the robot; its other arguments must be hashable.
     """
 
     @wraps(function)

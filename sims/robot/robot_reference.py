@@ -58,6 +58,9 @@ class RobotReference:
 
         Args:
             folder: folder of the TOML file; None stores the model file's name without a folder.
+
+        Returns:
+            Entries of the file, of which `ROBOT_KEYS` are all possible keys.
         """
         model_path = self.path.name if folder is None else _make_relative_path(folder, self.path)
         # Empty entries are left out.
@@ -122,7 +125,12 @@ def make_robot_reference(kind: type[RobotSimulator]) -> RobotReference:
 
 
 def _make_relative_path(folder: Path, path: Path) -> str:
-    """Return a path relative to a folder if they share a folder, else the absolute path."""
+    """Return a path relative to a folder if they share a folder, else the absolute path.
+
+    Args:
+        folder: folder to which the path is relative.
+        path: path of the model file.
+    """
     folder, path = folder.resolve(), path.resolve()
     # Paths on different drives of Windows have nothing in common.
     common = Path(os.path.commonpath([folder, path])) if folder.drive == path.drive else None

@@ -525,6 +525,9 @@ class RobotSimulator(SystemSimulator):
 
         Activations of filters, which a recording may state too, are left out, since they are not
         states of the system.
+
+        Args:
+            scenario: scenario of the run.
         """
         activations = select_initial_activations(self.robot, scenario.initial)
         state_values = {name: v for name, v in scenario.initial.items() if name not in activations}

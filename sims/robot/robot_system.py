@@ -105,6 +105,9 @@ class RobotSystem(System):
         Args:
             states: initial states by name.
             measured: names of the measured positions, such as ``q.crank``.
+
+        Returns:
+            All given states, changed where joints are placed.
         """
         unmeasured = [
             name for loop in cls.joint_loops for name in cls._list_unmeasured(loop, measured)
@@ -478,7 +481,14 @@ def _make_parameters(effect: type[Effect]) -> list[Parameter]:
 
 
 def _list_channels(robot: RobotModel) -> tuple[Channel, ...]:
-    """Return position, velocity and drive force channels of each joint, and the model's sensors."""
+    """Return position, velocity and drive force channels of each joint, and the model's sensors.
+
+    Args:
+        robot: robot whose joints and sensors are observed.
+
+    Returns:
+        Channels named ``q.JOINT``, ``qd.JOINT``, ``tau.JOINT`` and ``s.SENSOR``, in this order.
+    """
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     channels = [Channel(f"q.{j.name}", j.unit, says=f"position of joint {j.name}") for j in joints]
     channels += [

@@ -95,7 +95,11 @@ class RobotSnapshot(StateSnapshot):
     stiffness: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def select_element(self, batch_index: int) -> RobotSnapshot:
-        """Return the state of one batch element, as a batch of one."""
+        """Return the state of one batch element, as a batch of one.
+
+        Args:
+            batch_index: index of the batch element.
+        """
         selected = slice(batch_index, batch_index + 1)
         return replace(
             self,

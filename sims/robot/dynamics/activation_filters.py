@@ -103,6 +103,12 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
 
     They have MuJoCo's types `filter` and `filterexact`. Filters of actuators with two controls (a
     set point and its rate) are left out.
+
+    Args:
+        robot: robot with its actuators.
+
+    Returns:
+        Filters in the order of the actuators; an actuator has at most one.
     """
     import mujoco
 

@@ -45,6 +45,10 @@ class _BoundedCache:
         """Return the array cached under a key; otherwise compute it with `make` and cache it.
 
         If the cache exceeds `CACHE_BYTES`, all older arrays are removed.
+
+        Args:
+            key: all values on which the array depends.
+            make: computes the array.
         """
         if key not in self._arrays:
             array = make()

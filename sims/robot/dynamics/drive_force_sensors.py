@@ -163,6 +163,12 @@ class DriveSensorModel:
         """Return lower and upper limit of an actuator's joint force; infinite if unspecified.
 
         The actuator's own limit is multiplied by its gear; the joint may have a limit, too.
+
+        Args:
+            actuator: actuator of a joint.
+
+        Returns:
+            Lower and upper limit in N or N m.
         """
         gear = abs(float(self.robot.compiled.actuator_gear[actuator.id, 0]))
         low, high = actuator.force or (-np.inf, np.inf)

@@ -228,6 +228,9 @@ class StepForces:
         Args:
             k: number of the step; must increase by one from call to call.
             joint_states: joint states at the beginning of the step.
+
+        Returns:
+            Forces, and limits of dry friction, (L, D) each.
         """
         registers = self.registers
         for rows, values in zip(self._motion_groups, joint_states, strict=True):

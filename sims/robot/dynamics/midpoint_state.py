@@ -71,6 +71,9 @@ def predict_midpoint(x: Array, v: Array, a: Array, step: Array | float) -> tuple
         v: velocities.
         a: accelerations.
         step: step length in seconds.
+
+    Returns:
+        Positions and velocities, in arrays of the same shape.
     """
     half = 0.5 * step
     later = v + half * a

@@ -105,6 +105,9 @@ def make_batch_spec(robot: RobotModel) -> Any:
     rejects changes of its centre of mass; it also omits gravity compensation that is zero in the
     file. Here no body counts as simple, and gravity compensation is always computed. The motion is
     the same.
+
+    Args:
+        robot: robot whose spec is copied.
     """
     spec = robot.spec.copy()
     for body in spec.bodies:
@@ -148,6 +151,9 @@ def find_drive_sensors(model: Any, robot: RobotModel) -> dict[str, int]:
     Args:
         model: model of `compile_batch_model`, which has the sensors.
         robot: robot of this model.
+
+    Returns:
+        Column in the sensor data by name of the joint, for all joints of the file.
     """
     return {
         joint.name: int(model.sensor(DRIVE_SENSOR_PREFIX + joint.name).adr[0])
@@ -344,6 +350,9 @@ class MujocoBatch:
 
         An example is ``body_mass``, from which MuJoCo derives the inverse weights of bodies and
         joints.
+
+        Args:
+            field: name of a field of the model.
         """
         return any(
             field in field_effect.fields and field_effect.changes_derived_constants

@@ -191,7 +191,11 @@ class BatchResult(NamedTuple):
     series: tuple[Array, Array]
 
     def select(self, batch_indices: slice) -> BatchResult:
-        """Return the results of some batch elements."""
+        """Return the results of some batch elements.
+
+        Args:
+            batch_indices: consecutive batch elements, such as those of one run.
+        """
         series_x, series_v = self.series
         return BatchResult(
             x=self.x[batch_indices],

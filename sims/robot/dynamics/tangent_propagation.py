@@ -628,11 +628,11 @@ class TangentModel:
     def _interpolate_to_steps(self, values: Array) -> Array:
         """Interpolate values (N, k) at N linearisation points linearly to all S steps, (S, k).
 
-        Each point has k values. A point lies at each change of a command and at regular distances after it. Between two
-        points of one command the motion is smooth, so values are interpolated there; after the last
-        point of a command, they are extrapolated. `_earlier_point` and `_later_point` (S,) are the
-        two points for each step, and `_distance_share` (S,) is its distance from its own point, as
-        a share of their distance.
+        Each point has k values. A point lies at each change of a command and at regular distances
+        after it. Between two points of one command the motion is smooth, so values are interpolated
+        there; after the last point of a command, they are extrapolated. `_earlier_point` and
+        `_later_point` (S,) are the two points for each step, and `_distance_share` (S,) is its
+        distance from its own point, as a share of their distance.
         """
         slope = values[self._later_point] - values[self._earlier_point]
         result: Array = values[self._points.point_of_step] + self._distance_share[:, None] * slope

@@ -355,6 +355,12 @@ def _index_spec_elements(spec: Any) -> dict[ModelElement, Any]:
 
     A body is there twice: as ``body`` for its inertial, and as ``frame`` for its pose. The options
     of the model are the element ``option`` with the number 0.
+
+    Args:
+        spec: editable model; it is compiled here.
+
+    Returns:
+        Elements of the spec, whose attributes can be set, by kind and number.
     """
     # Elements have numbers only after compilation.
     spec.compile()

@@ -85,6 +85,9 @@ def _format_default_element(
     Args:
         element: the joint or actuator.
         values: its values by MJCF attribute.
+
+    Returns:
+        Name of the element, such as ``joint`` or ``position``, and texts by attribute.
     """
     # Most attributes are zero by default.
     class_values = {

@@ -93,6 +93,9 @@ class _Actuator:
         """Add a constant to the force of the actuator, before its gear, in N or N m.
 
         In MuJoCo the force is gain * control + bias; the constant is the first bias parameter.
+
+        Args:
+            force: the constant in N or N m.
         """
         import mujoco
 
@@ -375,6 +378,12 @@ def get_application_order(cause: FittedCause) -> tuple[int, int]:
     1. Time step and other options of the solver, on which the stiffness of dry friction depends.
     2. Causes that are numbers of the model.
     3. Effects on inputs, in the order in which a command passes them; and constant forces.
+
+    Args:
+        cause: cause to write.
+
+    Returns:
+        Number of the group in this list, counted from 0, and order within the group.
     """
     if cause.effect.startswith("numerics."):
         return 0, 0

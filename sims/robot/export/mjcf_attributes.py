@@ -206,6 +206,9 @@ def list_elements(model: Any) -> list[ModelElement]:
 
     They are joints with one coordinate, bodies, actuators with one control, pairs of geoms, round
     geoms, and the options.
+
+    Args:
+        model: compiled model.
     """
     import mujoco
 
@@ -290,6 +293,9 @@ def list_all_attributes(
         model: compiled model with the element.
         element: the element.
         target_values: wanted fields.
+
+    Returns:
+        Values by name of the MJCF attribute.
     """
     return {
         attribute.name: attribute.read(target_values, model, element)

@@ -44,6 +44,9 @@ class MjcfDocument:
         """Read the included files below an element, and those that they include in turn.
 
         All names are relative to the folder of the outer file, as in MuJoCo.
+
+        Args:
+            root: root element of a file whose include elements are followed.
         """
         for tag in root.walk():
             name = tag.attributes.get("file")
@@ -89,6 +92,9 @@ class MjcfDocument:
 
         Args:
             model: compiled MuJoCo model (`mujoco.MjModel`).
+
+        Returns:
+            Element of the text by kind and number in the compiled model.
 
         Raises:
             NotEditableError: the compiled model has other elements than the text, or the text has

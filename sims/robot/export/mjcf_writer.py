@@ -190,6 +190,9 @@ class MjcfWriter:
         Args:
             tag: element of the joint; without a type it is a hinge.
             statement: attribute values to write, with angles in rad.
+
+        Returns:
+            Texts by attribute.
         """
         values = format_attributes(statement.values)
         is_in_degrees = self.degrees and tag.get_attribute("type") in (None, "hinge")
@@ -212,6 +215,9 @@ class MjcfWriter:
         Args:
             tag: element of the actuator in the text; its name may be changed.
             statement: attribute values to write.
+
+        Returns:
+            Texts by attribute.
         """
         changed = statement.values
         target_attributes = list_all_attributes(self.model, statement.element, self.wanted)

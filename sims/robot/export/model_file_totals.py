@@ -36,10 +36,12 @@ It takes the model fields, the robot and the place.
 
 
 def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # noqa: ARG001
-    """Return the component of gravity along its direction in the file, in a list of one, m/s^2.
+    """Return the component of gravity along its direction in the file, in m/s^2.
+
+    It is a list of one, since each reader returns one number for each coefficient of its effect.
 
     Args:
-        f: fields of the model with the effects.
+        f: fields of the model with the effects, with one batch element (index 0).
         robot: the robot, whose file specifies the direction.
         place: unused; all readers have the same arguments.
     """
@@ -50,10 +52,12 @@ def _get_gravity_strength(f: Fields, robot: RobotModel, place: str) -> Sequence[
 
 
 def _get_force_limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
-    """Return the upper force limit of an actuator in a list of one; infinite if none.
+    """Return the upper force limit of an actuator; infinite if none.
+
+    It is a list of one, since each reader returns one number for each coefficient of its effect.
 
     Args:
-        f: fields of the model with the effects.
+        f: fields of the model with the effects, with one batch element (index 0).
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         place: name of the actuator.
     """

@@ -176,6 +176,9 @@ def displace_reference_pose(model: Any) -> Array:
     """Return a pose (nq,) near the reference pose of a compiled model, for a test motion.
 
     All coordinates have different displacements, so that swapped ones are detected.
+
+    Args:
+        model: the mujoco.MjModel.
     """
     import mujoco
 

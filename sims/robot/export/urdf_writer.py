@@ -36,6 +36,8 @@ from sims.robot.model_field_effects import add_to_file_value, compute_factor
 from sims.robot.robot_model import RobotModel
 
 _TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_NO_INERTIAL = "a link of the body states no inertial"
+"""Reason why a change of mass or inertia cannot be written."""
 
 
 class UrdfWriter:
@@ -130,6 +132,9 @@ class UrdfWriter:
         Args:
             cause: effect on the body.
 
+        Returns:
+            Pairs of the name of a link, and its element ``<inertial>``.
+
         Raises:
             UnstatableCauseError: the mass of a link follows from its shapes, or no link has a mass.
         """
@@ -139,14 +144,14 @@ class UrdfWriter:
             link = self.links.get(name)
             inertial = _find_child(link, "inertial") if link else None
             if inertial is not None:
+                # An inertial of zero, such as that of a mere frame, adds nothing to the body.
                 inertials += [(name, inertial)] if _has_mass(inertial) else []
             elif link is None or _find_child(link, "collision"):
                 # The mass of this link follows from its shapes, or the file does not have the link.
                 # So the mass of the whole body is not stated.
-                inertials = []
-                break
+                raise UnstatableCauseError(_NO_INERTIAL)
         if not inertials:
-            raise UnstatableCauseError("a link of the body states no inertial")
+            raise UnstatableCauseError(_NO_INERTIAL)
         return inertials
 
     def _write_mass(self, cause: FittedCause) -> None:

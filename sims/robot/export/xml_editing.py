@@ -122,6 +122,10 @@ class XmlText:
         """Add an element to the tree at its start tag (called by the parser).
 
         Its end is that of the start tag until the end tag is parsed.
+
+        Args:
+            name: name of the element.
+            attributes: its attributes.
         """
         tag = XmlElement(name, attributes, self._parser.CurrentByteIndex)
         tag.inside = tag.end = self._find_end_of_tag(tag.begin)

@@ -200,6 +200,12 @@ def _get_principal_moments(body: Any) -> tuple[Array, Array | None]:
 
     A model file states either a full inertia tensor, or moments about the axes of the body's
     inertial frame; the axes are None then. Numbers that are missing count as zero.
+
+    Args:
+        body: body of a `mujoco.MjSpec`.
+
+    Returns:
+        Moments (3,), and axes (3, 3) as columns or None.
     """
     tensor = np.asarray(body.fullinertia, dtype=float)
     if np.isfinite(tensor).all() and tensor.any():
@@ -211,6 +217,11 @@ def _set_principal_moments(body: Any, moments: Array, axes: Array | None) -> Non
     """Write principal moments in kg m^2 into a body of the spec, about the given axes.
 
     Without axes, they are about the axes of the body's inertial frame.
+
+    Args:
+        body: body of a `mujoco.MjSpec`, changed in place.
+        moments: (3,) principal moments in kg m^2.
+        axes: (3, 3) principal axes as columns; None for those of the inertial frame.
     """
     if axes is None:
         body.inertia = moments

@@ -191,7 +191,11 @@ class OmittedShapes:
 
 
 def _replace_by_sphere(geom: Any) -> None:
-    """Replace a mesh by a sphere of the same mass and the density of water, without contacts."""
+    """Replace a mesh by a sphere of the same mass and the density of water, without contacts.
+
+    Args:
+        geom: geom of a `mujoco.MjSpec` with a stated mass, changed in place.
+    """
     import mujoco
 
     radius = (3.0 * geom.mass / (4.0 * np.pi * WATER_DENSITY)) ** (1.0 / 3.0)

@@ -267,6 +267,9 @@ def _map_fused_bodies(parents: Mapping[str, str], compiled: set[str]) -> dict[st
     Args:
         parents: parent of each body of the file that may be fused, by name.
         compiled: names of the bodies of the compiled model.
+
+    Returns:
+        Name of the containing body by name of the fused one.
     """
     aliases = {}
     for name in parents:

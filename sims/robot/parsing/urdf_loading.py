@@ -320,6 +320,9 @@ def _collect_links(files: ModelFileReader, root: Element) -> dict[str, Element]:
         files: reader of the files of the model.
         root: root element of the URDF.
 
+    Returns:
+        Elements ``<link>`` by name.
+
     Raises:
         InputError: a link has no name, or two links have the same name.
     """
@@ -415,6 +418,9 @@ def _find_parent_links(
         files: Reader of the model file, which locates errors.
         links: Elements ``<link>`` by name.
         joints: Elements ``<joint>``.
+
+    Returns:
+        Name of the parent link and element of the joint, by name of the child link.
 
     Raises:
         InputError: the links do not form a tree, or the type of a joint is unknown.

@@ -176,7 +176,12 @@ class _LineTrackingTreeBuilder:
         return f"{self.path}:{self.parser.CurrentLineNumber + self.above}"
 
     def begin(self, name: str, attributes: dict[str, str]) -> None:
-        """Add an element to the tree at its start tag, and store its file and line for messages."""
+        """Add an element to the tree at its start tag, and store its file and line for messages.
+
+        Args:
+            name: name of the element.
+            attributes: its attributes.
+        """
         element = Element(name, attributes)
         self.files.places[element] = self.here
         if self.open:
@@ -245,6 +250,9 @@ def format_tree(root: Element) -> tuple[str, list[Element]]:
 
     So the line in a message of MuJoCo about this text leads to the element, and to its line in the
     user's file.
+
+    Args:
+        root: root element; the texts between its elements are changed.
 
     Returns:
         The text, and the element that begins in each line.

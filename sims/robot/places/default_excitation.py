@@ -83,6 +83,9 @@ def make_default_recording(robot: RobotModel) -> DefaultRecording:
     * A servo receives positions or velocities.
     * A motor receives the force that holds the pose, plus a force that would move a free joint.
     * A robot without actuators is moved by forces at its joints.
+
+    Args:
+        robot: robot whose joints move.
     """
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     commands = _make_commands(robot, joints)

@@ -63,7 +63,11 @@ def observable_axes(robot: RobotModel, body: str) -> tuple[int, ...]:
 
 @lru_cache(maxsize=8)
 def make_reference_data(model: Any) -> Any:
-    """Return MuJoCo's data with the poses of all bodies in the reference pose of the model."""
+    """Return MuJoCo's data with the poses of all bodies in the reference pose of the model.
+
+    Args:
+        model: compiled model.
+    """
     import mujoco
 
     data = mujoco.MjData(model)

@@ -107,6 +107,9 @@ def list_places(
     Args:
         robot: robot whose places are listed.
         channels: names and units of the channels that it can observe.
+
+    Returns:
+        Places by kind, in the order of the joints, actuators and so on.
     """
     joints = _list_joint_places(robot)
     touching = {geom for pair in robot.contacts for geom in find_pair_geoms(robot, pair)}
@@ -129,6 +132,9 @@ def _list_joint_places(robot: RobotModel) -> list[EffectPlace]:
 
     A place has the unit, the typical force and inertia of its joint, what the model file states
     there, and what kinds of effects it may have.
+
+    Args:
+        robot: robot whose joints are listed.
     """
     from sims.robot.dynamics.joint_scales import coefficient_scales
 
@@ -198,6 +204,9 @@ def _list_body_places(robot: RobotModel) -> list[EffectPlace]:
     centre of mass is the box of the link. That of a payload is a cube about its middle, since a
     payload may stick out of the link: to the longest side of the box, or to half the length of the
     robot's longest link. Along axes in which offsets cannot be observed, both ends are zero.
+
+    Args:
+        robot: robot whose bodies are listed.
     """
     mass = _compute_moving_mass(robot)
     # The length of a link is the distance of its body from the parent body. Body 0 is the world.
@@ -399,6 +408,9 @@ def _get_servo_gains(robot: RobotModel, actuator: int) -> dict[str, float]:
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         actuator: number of the actuator.
+
+    Returns:
+        The two numbers by name of the effect that changes them.
     """
     _, stiffness, damping, *_ = robot.compiled.actuator_biasprm[actuator].tolist()
     return {"actuator.stiffness": stiffness, "actuator.damping": damping}
@@ -409,6 +421,13 @@ def _get_body_file_values(robot: RobotModel, body: int) -> dict[str, float]:
 
     The length is the distance from its parent body. It is zero if the parent does not move, since
     another distance would then only move the whole robot.
+
+    Args:
+        robot: robot with the body.
+        body: number of the body in the compiled model.
+
+    Returns:
+        The two numbers by name of the effect that changes them.
     """
     model = robot.compiled
     has_moving_parent = int(model.body_weldid[model.body_parentid[body]]) != 0
@@ -425,6 +444,9 @@ def _get_file_values(robot: RobotModel, dof: int, joint: int) -> dict[str, float
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
         dof: address of the joint's velocity.
         joint: number of the joint in the compiled model.
+
+    Returns:
+        Numbers by name of the effect that changes them, such as ``drag.linear``.
     """
     model = robot.compiled
     return {

@@ -157,12 +157,20 @@ def _make_force_method(effect: type[Force]) -> Callable[[Force, Array, StateSnap
 
     The registered effect is written for a system with one coordinate. The new method passes it
     the state of its joint alone, and writes the result into that joint's column.
+
+    Args:
+        effect: registered effect with a force.
     """
 
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
         """Compute the forces (L, D), which are zero at all joints but that of the effect.
 
         There are L batch elements and D joints.
+
+        Args:
+            self: the effect at its place.
+            c: (K, L, 1) the K coefficients.
+            moment: snapshot of the robot.
         """
         joint = cast(int, self.coordinate)
         joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
@@ -219,6 +227,11 @@ def _make_shared_force_method(effect: type[Force], joints: Sequence[int]) -> Cal
         """Compute the forces (L, D) along all driven joints from the total load of the supply.
 
         There are L batch elements and D joints.
+
+        Args:
+            self: the effect at its place.
+            c: (K, L, 1) the K coefficients.
+            moment: snapshot of the robot.
         """
         robot = cast(RobotSnapshot, moment)
         # Forces (L, D) of the drives, the first of both loads of the transmissions.
@@ -238,10 +251,19 @@ def _make_limit_method(effect: type[Friction]) -> Callable[[Friction, Array, Sta
 
     The registered effect is written for a system with one coordinate. The new method passes it the
     state of its joint alone; `limit` is the largest friction force.
+
+    Args:
+        effect: registered effect with dry friction.
     """
 
     def limit(self: Friction, c: Array, moment: StateSnapshot) -> Array:
-        """Compute the friction limit (L, 1) of the effect's joint."""
+        """Compute the friction limit (L, 1) of the effect's joint.
+
+        Args:
+            self: the effect at its place.
+            c: (K, L, 1) the K coefficients.
+            moment: snapshot of the robot.
+        """
         joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(cast(int, self.coordinate))
         return effect.limit(self, c, joint_snapshot)
 
@@ -304,6 +326,9 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
 
     The registered effect is written for a system with one coordinate. The new method passes it
     the state of its joint alone, and writes the force into that joint's column.
+
+    Args:
+        effect: registered effect with a hidden state.
     """
 
     def act(
@@ -312,6 +337,12 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
         """Compute the forces (L, D), zero at other joints, and the rate of the hidden state.
 
         There are L batch elements and D joints.
+
+        Args:
+            self: the effect at its place.
+            c: (K, L, 1) the K coefficients.
+            moment: snapshot of the robot.
+            state: hidden state of the effect, (L, 1).
         """
         joint = cast(int, self.coordinate)
         joint_snapshot = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
