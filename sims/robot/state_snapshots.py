@@ -131,13 +131,13 @@ class RobotSnapshot(StateSnapshot):
         servo = self.servos.get(joint)
         has_servo = servo is not None and servo in self.inputs and self.stiffness.size
         return JointSnapshot(
-            self.alone[joint],
-            self.theta,
-            self.constants,
-            self.t,
-            self.x[:, joint_slice],
-            self.v[:, joint_slice],
-            inputs,
+            system=self.alone[joint],
+            theta=self.theta,
+            constants=self.constants,
+            t=self.t,
+            x=self.x[:, joint_slice],
+            v=self.v[:, joint_slice],
+            inputs=inputs,
             carried=self.carried[:, :, joint_slice],
             goal=self.inputs[servo] if has_servo and servo else np.full_like(self.t, np.nan),
             stiffness=self.stiffness[:, joint_slice] if has_servo else np.zeros_like(self.t),

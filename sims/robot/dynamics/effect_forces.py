@@ -35,19 +35,20 @@ def make_snapshot(
         stiffness: (L, D) stiffness of position servos; no servo is active if None.
     """
     return RobotSnapshot(
-        system,
+        system=system,
         # The system has neither parameters nor constants: all numbers are in MuJoCo's model.
-        np.zeros((len(x), 0)),
-        {},
-        t,
-        x,
-        v,
-        inputs,
-        carried,
-        system.alone,
-        dict(system.drives),
-        dict(system.servos),
-        np.zeros((0, 0)) if stiffness is None else stiffness,
+        theta=np.zeros((len(x), 0)),
+        constants={},
+        t=t,
+        x=x,
+        v=v,
+        inputs=inputs,
+        carried=carried,
+        # Each joint as a system of its own, the inputs of its actuators, and that of its servo.
+        alone=system.alone,
+        drives=dict(system.drives),
+        servos=dict(system.servos),
+        stiffness=np.zeros((0, 0)) if stiffness is None else stiffness,
     )
 
 

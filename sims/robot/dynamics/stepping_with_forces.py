@@ -268,9 +268,11 @@ class _CallbackContexts:
             first: number of the first step of the call. Before step 0 the acceleration is set to
                 zero, because MuJoCo's initial one lacks the applied forces.
         """
-        # 0 in this column means that the acceleration is in the registers, not in MuJoCo's data.
+        # 0 in this column of all contexts tells the callback to take the acceleration from the
+        # registers at the first step of the call, not from MuJoCo's data.
         self._table[:, HAS_ACCELERATION] = 0
         for batch_index, registers in enumerate(self._registers):
+            # The last index adds the axis of length 1 that registers have.
             registers[self._acceleration_registers] = (
                 self._accelerations[batch_index, self._dofs, None] if first else 0.0
             )

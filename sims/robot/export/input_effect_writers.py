@@ -219,6 +219,7 @@ def _write_delay(actuator: _Actuator, delay: float) -> str | None:
     Raises:
         UnstatableCauseError: the delay is negative, or the file states one already.
     """
+    # Fields have one batch element, 0.
     step = float(actuator.fields["opt.timestep"][0])
     if delay == 0:
         return None
@@ -258,6 +259,7 @@ def _write_lag(actuator: _Actuator, lag: float) -> str | None:
         return None
     if not (actuator.direct and actuator.fixed and actuator.single):
         raise UnstatableCauseError("its actuator has dynamics already")
+    # Fields have one batch element, 0. The first parameter of a filter is its time constant.
     actuator.fields["actuator_dyntype"][0, actuator.id] = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
     parameters = actuator.fields["actuator_dynprm"][0, actuator.id]
     parameters[:] = 0.0
