@@ -232,6 +232,7 @@ def _list_source_classes(kind: type) -> list[type]:
     classes: list[type] = []
     waiting = [kind]
     while waiting:
+        # `__mro__` has the class itself and all its bases.
         for part in waiting.pop().__mro__:
             # Classes of the standard library, such as `ABC`, are determined by the version of
             # Python. A class that a metaclass made may name a module there, but is not defined in
@@ -300,6 +301,12 @@ def _read_class_source(kind: type) -> str:
 
     Args:
         kind: Class whose source determines results and is therefore hashed.
+
+    Returns:
+        Text of the class, or of the whole notebook cell that defines it.
+
+    Raises:
+        InputError: the source cannot be found.
     """
     try:
         return inspect.getsource(kind)

@@ -108,6 +108,7 @@ def _count_simulated_samples(problem: TuningProblem) -> tuple[int, float]:
         return sum(s.times.size for s in scenarios), seconds / step
     samples = experiment.sampling.samples
     seconds = (samples - 1) / experiment.sampling.rate
+    # Between two samples there is at least one step.
     return samples, max(seconds / step, samples - 1)
 
 
@@ -177,15 +178,20 @@ def estimate_comparison_need(
     workers = _MAX_CLUSTER_WORKERS if cluster else max(jobs, 1)
     memory = (
         runs * _RUN_MEMORY
+        # One fitted observation and the held-out ones for each target.
         + targets * (1 + held_out) * sizes.observation
         + row_count * _ROW_MEMORY
+        # The workers of a cluster run on other machines.
         + (0 if cluster else jobs * _WORKER_BYTES)
+        # The largest run stores its proposals and their losses.
         + max_budget * (sizes.dim + 1) * BYTES_PER_NUMBER
         + training_simulations * sizes.observation
+        # The state of one running simulation.
         + sizes.steps * BYTES_PER_STEP
     )
     seconds = (
         simulations * sizes.simulation * (1 + held_out) / workers
+        # At least one training, which one process executes.
         + training_simulations * sizes.simulation
         + row_count * _ROW_SECONDS
         + runs * _RUN_SECONDS

@@ -92,6 +92,7 @@ class ClusterPool:
         # Dask's own log messages are suppressed; this class reports losses in one line.
         for name in [*logging.root.manager.loggerDict, "asyncio"]:
             if name.split(".")[0] in ("distributed", "tornado", "asyncio"):
+                # No message has a level above CRITICAL.
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         self.address = address
         try:
@@ -109,6 +110,9 @@ class ClusterPool:
         """Raise an error unless there are workers, all with the code and packages of this process.
 
         Other code could give other results, and the id of a run states the code of this process.
+
+        Raises:
+            InputError: there are no workers, or one has other code or package versions.
         """
         threads = self._client.nthreads()
         if not threads:
@@ -288,7 +292,14 @@ class ClusterPool:
         return self._sent_files[path]
 
     def _receive_result(self, result: Any) -> Any:
-        """Return the value of a worker's result; trained weights are written to the local cache."""
+        """Return the value of a worker's result; trained weights are written to the local cache.
+
+        Args:
+            result: kind, value and content of a file, from `run_on_worker`.
+
+        Returns:
+            The value; for a training with the path of the weights on this machine.
+        """
         kind, value, content = result
         if kind == "weights":
             path = get_weights_folder() / value.path.name
@@ -314,6 +325,7 @@ def _hash_this_worker() -> tuple[str, str]:
 
 
 _pools: dict[tuple[int, str], LocalPool] = {}
+"""Pool of one process for each thread of this worker and each set of plugins."""
 
 
 def run_on_worker(
@@ -363,6 +375,7 @@ def run_on_worker(
         _pools[key].load_plugins(
             [_write_plugin_file(plugin, content) for plugin, content in plugins]
         )
+    # One call gives exactly one pair of index and result.
     ((_, result),) = _pools[key].iterate_results([(function, arguments)], seconds)
     if function is train_or_load and isinstance(result, TrainingResult):
         return "weights", result, result.path.read_bytes()

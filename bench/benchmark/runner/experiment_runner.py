@@ -164,10 +164,14 @@ def check_tuners(experiment: Experiment) -> dict[str, str]:
 
     Returns:
         Reason by label of each tuner that is skipped.
+
+    Raises:
+        InputError: a tuner cannot be built, for example because it refuses an option.
     """
     skipped = {}
     for entry in experiment.tuners:
         try:
+            # A tuner that must be built in isolation has been built there by the check itself.
             if experiment.trusted or not must_build_isolated(entry):
                 build_tuner(entry)
         except PartUnavailableError as error:
@@ -249,8 +253,8 @@ def run_experiment(
     if pool is not None or jobs or not experiment.trusted:
         check_classes_importable(experiment, workers=pool is not None or jobs > 0)
     # This process has the true parameters, and a tuner's process may run as the same user.
-    hidden = nullcontext() if experiment.trusted else not_dumpable()
-    with hidden, pool or make_pool(jobs) as workers:
+    memory_protection = nullcontext() if experiment.trusted else not_dumpable()
+    with memory_protection, pool or make_pool(jobs) as workers:
         workers.load_plugins(describe_plugins(plugins, experiment))
         try:
             _compute_target_spectra(results, progress)
@@ -316,14 +320,15 @@ def _compute_target_spectra(results: ExperimentRun, progress: ProgressFactory) -
         progress: makes a progress bar from a title and the number of steps.
     """
     problem = results.problem
-    targets = {job.target.blinded.name: job.target for job in results.plan}
     if not problem.has_several_parameters:
         return
+    targets = {planned.target.blinded.name: planned.target for planned in results.plan}
     step = progress("identifiability", len(targets))
     for name, target in targets.items():
         if (spectrum := problem.compute_spectrum(target)) is not None:
             results.spectra[name] = spectrum
         step()
+    # The spectra have opened the simulators; the runs do not use those of this process.
     problem.close()
 
 
@@ -414,19 +419,19 @@ def _store_result(results: ExperimentRun, index: int, outcome: RunOutcome | Exce
         index: position of the run in the plan.
         outcome: what the worker returned or raised.
     """
-    problem, job = results.problem, results.plan[index]
+    problem = results.problem
+    request, target = results.plan[index].request, results.plan[index].target
     if isinstance(outcome, TimeoutError):
         reason = f"killed after its limit of {problem.experiment.timeout:g} s"
-        outcome = make_unfinished_outcome(problem, job.target, "timeout", reason)
+        outcome = make_unfinished_outcome(problem, target, "timeout", reason)
     elif isinstance(outcome, WorkerDiedError):
-        outcome = make_unfinished_outcome(problem, job.target, "crashed", str(outcome))
+        outcome = make_unfinished_outcome(problem, target, "crashed", str(outcome))
     elif isinstance(outcome, RunEndedError):
-        outcome = make_unfinished_outcome(problem, job.target, outcome.status, outcome.reason)
+        outcome = make_unfinished_outcome(problem, target, outcome.status, outcome.reason)
     elif isinstance(outcome, Exception):
         reason = "".join(traceback.format_exception(outcome))
-        outcome = make_unfinished_outcome(problem, job.target, "crashed", reason)
-    results.notes.add(job.request.entry.label, outcome)
-    columns = build_rows(
-        problem, job.request, job.target, outcome, results.spectra.get(job.target.blinded.name)
-    )
-    results.run_sink.append(index, columns, make_status(problem, job.request, outcome))
+        outcome = make_unfinished_outcome(problem, target, "crashed", reason)
+    results.notes.add(request.entry.label, outcome)
+    spectrum = results.spectra.get(request.target.name)
+    columns = build_rows(problem, request, target, outcome, spectrum)
+    results.run_sink.append(index, columns, make_status(problem, request, outcome))

@@ -84,11 +84,14 @@ def _make_stub(description: dict[str, Any]) -> Any:
     """Make the stub of a tuner or diagnoser: a class with its properties, but without its code.
 
     Args:
-        description: properties of the class, as the isolated process has described them.
+        description: properties of the class, from `_validate_part`: ``says`` is the first
+            paragraph of its docstring, ``trains_as`` the tuner whose random stream it trains with,
+            ``source`` a hash of its source.
     """
     base = TunerStub if description["kind"] == "tuner" else DiagnoserStub
     fields: dict[str, Any] = {
         "name": str(description["name"]),
+        # Code of the plugin wrote both flags, so they may have any value: only a true bool counts.
         "stochastic": description["stochastic"] is not False,
         "learned": description["learned"] is True,
         "trains_as": str(description["trains_as"]),
@@ -102,6 +105,8 @@ def _make_stub(description: dict[str, Any]) -> Any:
 
 def register_plugins(plugins: Iterable[Plugin]) -> None:
     """Register plugins in this process: load their code, or make stubs of their descriptions.
+
+    A stub is a class with the properties of a tuner or diagnoser, but without its code.
 
     Raises:
         InputError: a plugin has an error.
@@ -135,9 +140,11 @@ def load_plugins_for_experiment(paths: Sequence[str], experiment: Experiment) ->
     """
     described_plugins = [Plugin(path) for path in paths]
     if not experiment.trusted:
+        # `settings` are those of the tuned simulator, `world` those of the true system.
         required_names = {experiment.simulator} | find_named_effects(
             experiment.settings, experiment.world
         )
+        # An extended simulator (a .toml file) needs the system and the effects that it names.
         described_plugins = inspect_plugins(paths, required_names | _list_extended_names(paths))
         _check_no_shared_file(described_plugins, experiment)
     register_plugins(described_plugins)
@@ -170,9 +177,12 @@ def check_classes_importable(experiment: Experiment, workers: bool = True) -> No
     used_parts = list_compared_parts(experiment)
     if workers:
         effect_names = list_effect_names(experiment.settings, experiment.world)
+        # The simulator of a robot is made from its model file, so it needs no registered class.
         simulated = [] if experiment.model else [(simulators, experiment.simulator)]
         used_parts = [*simulated, *used_parts, *((effects, name) for name in effect_names)]
     for registry, name in used_parts:
+        # The snapshot has the classes that were added in this process; a class without a plugin
+        # file was defined by the script or notebook.
         registered = registry.snapshot().get(name)
         if registered is not None and registered.path is None:
             raise make_unreachable_error(registry.kind, name, registered.part)
@@ -206,6 +216,9 @@ def make_unreachable_error(kind: str, name: str, part: type) -> InputError:
 
 def _list_extended_names(paths: Iterable[str]) -> set[str]:
     """Return the names of the systems and effects of extended simulators.
+
+    An extended simulator is a file that names a system and the effects to add to it. An effect at
+    one joint of a robot is written ``EFFECT@JOINT``, of which only the effect is returned.
 
     Args:
         paths: plugin files; those of extended simulators end in .toml.
@@ -333,6 +346,10 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
         paths: plugin files.
         needed: names of the simulators and effects that this process needs.
 
+    Returns:
+        One plugin for each file: whether to load it, and the descriptions of its tuners and
+        diagnosers.
+
     Raises:
         InputError: a file cannot be used.
     """
@@ -389,6 +406,9 @@ def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
         name: registered name.
         kind: ``tuner`` or ``diagnoser``.
 
+    Returns:
+        A plugin without a file, which is not loaded here, with the one description.
+
     Raises:
         PartUnavailableError: it cannot be used here.
         InputError: it cannot be inspected.
@@ -396,9 +416,11 @@ def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
     descriptions = _ask_isolated_process({"file": "", "kind": kind, "name": name}, name)
     if not descriptions:
         raise InputError(f"plugin {name}: its process did not describe it")
+    # The key is set if a package is missing that the tuner or diagnoser needs.
     if "skipped" in descriptions[0]:
         raise PartUnavailableError(kind, name, descriptions[0]["skipped"])
-    # Under another name or kind, the part itself would have no stub, and its code would run here.
+    # The description may state a wrong name or kind. Registered under these, the requested part
+    # would have no stub, and its code would run here.
     return Plugin("", False, ({**descriptions[0], "kind": kind, "name": name},))
 
 
@@ -424,7 +446,7 @@ def _ask_isolated_process(question: dict[str, str], label: str) -> list[dict[str
         label: name of the plugin in error messages.
 
     Returns:
-        Descriptions of the tuners or diagnosers of the plugin.
+        Descriptions of the registered classes of the plugin, from `_validate_part`.
 
     Raises:
         InputError: the file does not exist, or the plugin cannot be loaded.
@@ -437,6 +459,7 @@ def _ask_isolated_process(question: dict[str, str], label: str) -> list[dict[str
     except RunEndedError as ended:
         message = "takes too long to load" if ended.status == "timeout" else ended.reason
         raise InputError(f"plugin {label}: {message.strip().splitlines()[-1]}") from None
+    # The answer is a list of descriptions, or a dictionary with the message of an error.
     if isinstance(answer, dict):
         raise InputError(with_isolation(str(answer.get("fault"))))
     return [_validate_part(part, file) for part in answer]
@@ -471,6 +494,11 @@ def _validate_part(part: Any, file: str) -> dict[str, Any]:
         part: description from the isolated process, any JSON value.
         file: path of the plugin file; empty for an installed plugin.
 
+    Returns:
+        The checked description: ``kind``, ``name``, ``says`` (first paragraph of the docstring),
+        ``trains_as``, ``file``, ``module``, ``source`` (a hash), ``stochastic``, ``learned``, and
+        ``skipped`` (the reason) if it cannot be used here.
+
     Raises:
         InputError: it is not the description of a registered class.
     """
@@ -495,7 +523,8 @@ def serve_inspection(
     """Answer one question about a plugin; runs in the isolated process.
 
     To answer, it must import the plugin, whose code is not trusted. After the answer it waits until
-    the harness ends it.
+    the harness ends it. It sends two messages: ``R`` ("ready") with the active layers, and ``K``
+    with the answer, a list of descriptions or ``{"fault": message}``.
 
     Args:
         channel: channel to the harness.
@@ -513,6 +542,7 @@ def serve_inspection(
     except InputError as error:
         answer = {"fault": str(error)}
     channel.send_document(b"K", answer)
+    # No further message comes; this waits until the harness ends the process.
     channel.receive()
 
 

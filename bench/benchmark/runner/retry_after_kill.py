@@ -46,6 +46,8 @@ class RepeatedRequests:
     """
 
     def __init__(self) -> None:
+        # All different requests so far in their order, and the number of those made since the last
+        # restart.
         self._earlier: list[bytes] = []
         self._position = 0
 
@@ -56,9 +58,13 @@ class RepeatedRequests:
     def check(self, request: bytes) -> None:
         """Store a new request; in a repetition, compare it with the request at this position.
 
+        Args:
+            request: what the work requests, as bytes; equal requests have equal bytes.
+
         Raises:
             RunEndedError: it differs from the one before the kill.
         """
+        # The work has reached a request that no earlier attempt made.
         if self._position == len(self._earlier):
             self._earlier.append(request)
         elif self._earlier[self._position] != request:

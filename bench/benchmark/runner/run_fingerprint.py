@@ -58,6 +58,10 @@ def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[
     The hashes are stored with the study. When it is resumed, they are computed again, and a
     difference is reported by its name.
 
+    Args:
+        experiment: configuration of the experiment.
+        plugins: paths of the plugin files that it needs.
+
     Returns:
         Hashes by readable name.
     """
@@ -201,6 +205,7 @@ class RunIds:
         if entry.label not in self._entry_digests:
             kind = tuners.get(entry.tuner)
             training_budget = self._experiment.training_budget if kind.learned else 0
+            # The random effects of the training matter only for an entry that trains with them.
             nuisance = [dict(self._experiment.nuisance)] if entry.randomised else []
             self._entry_digests[entry.label] = compute_digest(
                 entry.tuner,

@@ -114,6 +114,7 @@ _problems: dict[int, tuple[Experiment, TuningProblem]] = {}
 
 def get_problem(experiment: Experiment) -> TuningProblem:
     """Return the problem of an experiment; it is cached until another one is needed."""
+    # There is at most one problem, under the key 0.
     cached = _problems.get(0)
     if cached is None or cached[0] != experiment:
         close_problem()
@@ -193,8 +194,10 @@ def _execute_once(
 
         trace, written, import_seconds = _run_isolated(experiment, request, task, evaluate)
     seconds = perf_counter() - started
+    # A trusted tuner runs in this process, and could simulate without the harness.
     hidden_simulations = problem.simulated - simulated_before - len(trace.losses)
-    # A simulator that raises an error has counted simulations without a result.
+    # A crashed run is exempt: a simulator that raises an error has counted simulations that have no
+    # result.
     if hidden_simulations > 0 and trace.status != "crashed":
         raise HiddenSimulationError(f"{hidden_simulations} simulations outside the budget")
     if trace.status == "crashed":
@@ -203,7 +206,7 @@ def _execute_once(
     # Held-out runs are simulated after the run, so that the tuner cannot see them.
     heldout = None
     if target.held_out.scenarios:
-        # The evaluator has no points yet, so it simulates all recommendations.
+        # No proposal was simulated on these runs, so there are none (`[:0]`) to look up.
         heldout = ProposalEvaluator(problem, target.held_out).compute_rmse(
             trace.proposals[:0], trace.recommendations
         )
@@ -245,7 +248,7 @@ def _run_isolated(
     Returns:
         The trace, the files that the tuner wrote, and the seconds of its imports.
     """
-    assert request.tuned is not None
+    assert request.tuned is not None  # otherwise the tuner is trusted and runs in this process
     state = None if request.weights is None else read_weights(request.weights)
     stream_names = _list_stream_names(experiment, request)
     tuner_context = start_isolated_tuner(

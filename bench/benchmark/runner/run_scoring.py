@@ -19,9 +19,16 @@ def make_unfinished_outcome(
 ) -> RunOutcome:
     """Make the outcome of a run that ended without a trace, as if its process was killed.
 
-    It has no simulations, and its only recommendation is the start.
+    It has no simulations, and its only recommendation is the start of the target.
+
+    Args:
+        problem: tuning problem.
+        target: target of the run.
+        status: how the run ended, such as ``crashed`` or ``timeout``.
+        reason: reason of the status.
     """
     trace = RunTrace.make_unfinished(status, reason, target.blinded.start)
+    # The errors have one row, for the start, which was not simulated.
     unknown_errors = np.full((1, len(problem.channels)), np.nan)
     return RunOutcome(trace, obs_rmse=unknown_errors, heldout_rmse=None, seconds=0.0)
 
@@ -63,7 +70,8 @@ def build_rows(
         target: target with its true parameters.
         outcome: outcome of the run.
         spectrum: Fisher-information spectrum of the target; if given, parameter errors along stiff
-            and along sloppy directions are added.
+            and along sloppy directions are added. These are the directions of the parameter space
+            that the data determine well and badly.
 
     Returns:
         Values by column name.
@@ -90,6 +98,7 @@ def build_rows(
         columns["stiff_error"], columns["sloppy_error"] = spectrum.compute_directional_errors(
             errors_in_widths
         )
+    # The main error is that of one channel, which the experiment selects.
     columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
     # All runs of a comparison have the same columns, so that their rows form one table.
     unknown_errors = np.full((simulations + 1, len(problem.channels)), np.nan)
@@ -118,7 +127,10 @@ def _build_parameter_columns(
     Args:
         problem: tuning problem of the experiment.
         target: target with its true parameters.
-        outcome: outcome of the run.
+        outcome: outcome of the run with k simulations.
+
+    Returns:
+        Columns of k + 1 values by name; row 0 is the start, which has no proposal.
     """
     cube = problem.cube
     recommended = cube.to_physical(outcome.trace.recommendations)

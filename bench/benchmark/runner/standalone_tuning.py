@@ -87,7 +87,7 @@ def run_tuner(
 
 
 def spread_start_points(count: int, dim: int) -> Array:
-    """Return quasi-random starting points in the unit cube.
+    """Return quasi-random starting points, which cover the unit cube evenly.
 
     Args:
         count: number of points.
@@ -96,4 +96,5 @@ def spread_start_points(count: int, dim: int) -> Array:
     Returns:
         (count, dim) points.
     """
+    # A fixed shift of the sequence instead of a random one gives the same points in each call.
     return generate_quasi_random_points(count, np.full(dim, 0.5))

@@ -58,13 +58,16 @@ def get_weights_folder() -> Path:
 def write_weights(
     path: Path, state: Mapping[str, Array], simulations: int, seconds: float
 ) -> TrainingResult:
-    """Write a file atomically, because several processes may train the same tuner.
+    """Write trained weights to a file, atomically because several processes may train the tuner.
 
     Args:
         path: path of the NumPy archive, named by the training key.
         state: weights by name.
         simulations: number of simulations of the training.
         seconds: duration of the training in seconds.
+
+    Returns:
+        The path and the cost of the training.
 
     Raises:
         RunEndedError: an array has a name that is reserved.

@@ -53,6 +53,7 @@ class Notes:
         written = outcome.written
         tuner.files += written.files
         tuner.names |= dict.fromkeys(written.names)
+        # A run names only the first files that its tuner has written.
         tuner.unnamed = tuner.unnamed or written.files > len(written.names)
         if outcome.import_seconds:
             tuner.import_seconds.append(outcome.import_seconds)
@@ -72,6 +73,7 @@ class Notes:
                 )
             seconds = median(tuner.import_seconds or [0.0])
             runs = len(tuner.import_seconds)
+            # With the isolation "run" each run has a new process, which imports everything again.
             if self.isolation == "run" and runs > 1 and seconds >= SLOW_IMPORTS:
                 lines.append(
                     f"tuner {label}: its imports take {seconds:.1f} s in each of {runs} runs; with "

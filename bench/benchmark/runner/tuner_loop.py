@@ -71,7 +71,7 @@ class RunTrace:
         return cls(
             status=status,
             reason=reason,
-            proposals=points[:0],
+            proposals=points[:0],  # no points, but with the shape (0, dim)
             losses=no_values,
             recommendations=points,
             tuner_seconds=no_values,
@@ -95,7 +95,8 @@ def _check_proposals(proposed: object, dim: int, label: str) -> Array:
         _DivergenceError: a point is not finite.
     """
     points = to_points(proposed, dim, label)
-    # Nearly all points are inside, so the expensive check is done only if some are not.
+    # Nearly all points are inside, so the expensive check is done only if some are not. A point
+    # with NaN counts as outside, because comparisons with NaN are false.
     if not _is_in_unit_cube(points):
         if not np.isfinite(points).all():
             first = points[~np.isfinite(points).all(axis=1)][0]
@@ -140,6 +141,7 @@ class _RunRecord:
 
     def recommend(self, recommendation: Array) -> None:
         """Record what the tuner recommends after all evaluations so far."""
+        # This replaces the default recommendation, which `add` has stored.
         self._recommended[-1] = _check_proposals(recommendation, self._dim, "recommendations")[0]
 
     def add(self, points: Array, losses: Array, stays: bool) -> None:
@@ -203,10 +205,10 @@ def drive_tuner(
     """Run a tuner on a task until its budget is used, it stops, or it fails.
 
     A tuner is a generator that yields proposals and receives their evaluations. Proposals outside
-    the unit cube are moved to its boundary. A batch that would exceed the budget is shortened. The
-    `recommendations` follow `methods.tuner.Proposal`; for k = 0 simulations the start is
-    recommended, unless the tuner recommends another point before its first simulation. The way in
-    which the loop ends becomes the status of the run.
+    the unit cube are moved to its boundary. A batch that would exceed the budget is shortened.
+    After k simulations the tuner recommends the point that it has stated, or else the simulated
+    point with the lowest loss; for k = 0 this is the start. The way in which the loop ends becomes
+    the status of the run.
 
     Args:
         tuner: tuner, trained if it needs training, in this process or in another one.
@@ -375,7 +377,8 @@ class ProposalEvaluator:
             points: (n, dim) points of the unit cube.
 
         Returns:
-            Observations (n, T, C) and losses (n,); NaN and infinite if the simulation failed.
+            Observations (n, T, C) and losses (n,). A failed simulation has NaN observations and an
+        infinite loss.
         """
         observations = self._problem.simulate(points, self._scenarios)
         has_one_point_and_channel = observations.shape[0] == observations.shape[2] == 1
@@ -414,12 +417,12 @@ class ProposalEvaluator:
         Shapes: T samples, C channels.
 
         Args:
-            observations: (n, T, C) simulated channels of n proposals; overwritten.
+            observations: (n, T, C) simulated channels of n proposals.
         """
         difference = observations - self._observed
         if self._missing is not None:
             difference[:, self._missing] = 0.0
-        # Squared in place, because the observations of a large batch would not fit in memory twice.
+        # Squared in place, because a further array of this size might not fit in memory.
         difference *= difference
         sums: Array = np.add.reduce(difference, axis=1)
         return sums

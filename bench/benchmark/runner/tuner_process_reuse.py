@@ -24,7 +24,9 @@ _MAX_WAITING_TUNERS = 8
 
 
 _fork_servers: dict[int, ForkServerClient] = {}
+"""Fork server of this process, under the key 0; empty before the first use."""
 _idle_tuners: OrderedDict[Any, IsolatedTuner] = OrderedDict()
+"""Isolated tuners that wait for another run, the one that has waited longest first."""
 
 
 def get_fork_server() -> ForkServerClient:
@@ -92,15 +94,18 @@ def make_part_spec(
         name: registered name.
         options: options with which it is built.
     """
-    # The class here may be a stub, whose attribute `module` names the module with the code.
+    # `file` is the plugin file, or None for a part of an installed package.
     kind, file = registry.get(name), registry.place(name)
+    # The class here may be a stub, whose attribute `module` names the module with the code.
     module = getattr(kind, "module", "") or kind.__module__
-    preloaded = (
-        find_preloadable_packages(str(file) if file else find_source_file(module))
-        if file or module
-        else ()
+    source_file = str(file) if file else find_source_file(module)
+    return TunerSpec(
+        kind.name,
+        module,
+        str(file or ""),
+        dict(options or {}),
+        find_preloadable_packages(source_file),
     )
-    return TunerSpec(kind.name, module, str(file or ""), dict(options or {}), preloaded)
 
 
 def start_part_process(
@@ -163,10 +168,12 @@ def start_isolated_tuner(
         KilledExternallyError: the process was killed externally.
     """
     is_reused = isolation == "tuner"
-    # Weights are hashed only if an idle tuner could have different ones.
+    # Weights are hashed only if an idle tuner could have different ones. No idle tuner has the key
+    # None.
     key = (repr(tuned), seed, hidden, memory, _hash_state(state or {})) if is_reused else None
     tuner = _idle_tuners.pop(key, None)
     if tuner is not None:
+        # Its imports were counted in the run that started it.
         tuner.import_seconds = 0.0
     if tuner is None or not tuner.child.is_alive:
         child = start_part_process(
@@ -184,6 +191,7 @@ def start_isolated_tuner(
         raise
     if not is_reused:
         tuner.child.end()
+    # The run may have ended the process, for example after a failure.
     elif tuner.child.is_alive:
         _idle_tuners[key] = tuner
         while len(_idle_tuners) > _MAX_WAITING_TUNERS:

@@ -127,16 +127,17 @@ def _handle_message(
     Raises:
         ProtocolError: the message is not valid here.
     """
-    # The position of the simulator in the list: 0 for training, 1 for evaluation.
-    which = message.flags & EVALUATION_SIMULATOR_FLAG
+    # The position of the simulator in the list: 0 for training, 1 for evaluation (flag value 1).
+    simulator_index = message.flags & EVALUATION_SIMULATOR_FLAG
     has_known_flags = message.flags <= EVALUATION_SIMULATOR_FLAG | SIMULATE_FLAG
     if message.kind == b"W" and callback is not None:
         callback.epoch(*_parse_progress(message.to_document()))
         child.send(b"K", deadline=_NO_DEADLINE)
-    elif message.kind == b"P" and has_known_flags and (callback is not None or not which):
-        if which and callback is not None and len(simulators) == 1:
+    elif message.kind == b"P" and has_known_flags and (callback is not None or not simulator_index):
+        if simulator_index and callback is not None and len(simulators) == 1:
+            # `ground` is the simulator with which the callback evaluates the tuner.
             simulators.append(callback.ground)
-        _serve_simulation(child, message, simulators[which])
+        _serve_simulation(child, message, simulators[simulator_index])
     else:
         raise ProtocolError("it sent a message of an unexpected kind")
 
@@ -162,6 +163,10 @@ def _serve_simulation(
     It serves a learned tuner that trains in an isolated process. Without `SIMULATE_FLAG` only the
     properties are sent (message ``O``). A request that is not valid, or beyond the budget, is
     answered by a refusal (message ``X``), and the training can continue.
+
+    Properties: `training` (2, dim) is the range in the unit cube, `scale` (C,) the scale of each
+    channel, `lengths` the number of samples of each run, `scene` the present scenario (initial
+    values and inputs).
 
     Args:
         child: isolated process with the tuner.
@@ -282,7 +287,8 @@ class TrainingRequest:
     Attributes:
         entry: tuner with its options.
         seed: seed of the training.
-        tuned: specification of the tuner for an isolated process; None if it is trusted.
+        tuned: specification with which an isolated process builds the tuner; None if the tuner is
+            trusted and trains in this process.
         hidden: folders that this process must not access.
     """
 
@@ -352,8 +358,8 @@ def _train_or_read_weights(
     """
     requests.restart()
     entry, seed = request.entry, request.seed
-    name = compute_training_key(experiment, entry, seed)
-    path = get_weights_folder() / f"{name}.npz"
+    training_key = compute_training_key(experiment, entry, seed)
+    path = get_weights_folder() / f"{training_key}.npz"
     if path.exists() and not trains_anew:
         cached = read_training_cost(path)
         # Weights that do not fit must be reported now, and not in every run.
@@ -392,7 +398,11 @@ def _train(
         simulator: training simulator that counts its simulations.
         stream: words of the seed of the random stream.
         callback: receives the progress; None for no progress.
+
+    Returns:
+        Trained arrays by name.
     """
+    # A request without the specification of an isolated tuner is that of a trusted one.
     if request.tuned is None:
         trusted_tuner = build_tuner(request.entry)
         trusted_tuner.watch = callback
@@ -410,11 +420,12 @@ def _check_weights(request: TrainingRequest, path: Path) -> None:
     Raises:
         WeightsError: the tuner does not accept the weights.
     """
+    # A trusted tuner has no specification for an isolated process.
     if request.tuned is None:
         load_trained_tuner(request.entry, path)
         return
     try:
-        # The tuner restores the weights when it is started.
+        # The tuner restores the weights when it is started, so nothing is left to do in the block.
         with start_isolated_tuner(
             request.tuned, request.seed, "run", request.hidden, state=read_weights(path)
         ):

@@ -310,22 +310,29 @@ class _PrefetchPolicy:
     """Number of calls that a worker has at a time.
 
     If calls are short, a second one is queued, so that a worker does not wait for its next call.
+
+    Attributes:
+        depth: number of calls per worker, 1 or 2.
+        ended_calls: number of calls that have ended.
+        total_seconds: sum of their durations, from assignment to end.
     """
 
     depth: int = 1
-    ended: int = 0
-    busy: float = 0.0
+    ended_calls: int = 0
+    total_seconds: float = 0.0
 
     def record_duration(self, seconds: float) -> None:
         """Count a call that took a number of seconds."""
-        self.ended += 1
-        self.busy += seconds
+        self.ended_calls += 1
+        self.total_seconds += seconds
 
     def adapt(self) -> None:
         """Choose the number of calls per worker from the mean duration so far."""
+        if not self.ended_calls:
+            return
         # With two calls queued, the time of a call includes the wait for the one before it.
-        short = self.ended and self.busy / self.ended < self.depth * _SHORT_CALL_SECONDS
-        self.depth = 2 if short else 1
+        mean_seconds = self.total_seconds / self.ended_calls
+        self.depth = 2 if mean_seconds < self.depth * _SHORT_CALL_SECONDS else 1
 
 
 class LocalPool:
@@ -489,6 +496,9 @@ class _WorkerSlot:
         the cause, are put back to the front of `waiting`. pebble does not notice a worker that ends
         with exit code 0, so that is detected by its replacement.
 
+        Args:
+            waiting: calls of all workers that are not assigned, extended in place.
+
         Returns:
             Each call that has ended, with its result or exception.
         """
@@ -507,18 +517,23 @@ class _WorkerSlot:
                 )
         if not is_lost and self._was_replaced_without_result():
             is_lost = True
+            # A worker executes one call at a time; that one is lost with it.
             running = next(future for future in self.assigned_calls if future.running())
             ended_calls.append(
                 (self.assigned_calls.pop(running), WorkerDiedError(_describe_worker_exit(0)))
             )
         if is_lost:
             self._failed_restarts = 0 if ended_calls else self._failed_restarts
+            # `extendleft` reverses the order, so the calls are reversed before.
             waiting.extendleft(reversed(self.assigned_calls.values()))
             self._replace_process()
         return ended_calls
 
     def _was_replaced_without_result(self) -> bool:
-        """Return whether the process was replaced although its running call has no result."""
+        """Return whether pebble replaced the process although its running call has no result.
+
+        Each process of the pool reports its start, so a second report means a replacement.
+        """
         while self._start_receiver.poll():
             self._start_receiver.recv()
             self._start_count += 1
