@@ -485,9 +485,12 @@ def split_by_training(view: ComparisonView, level: float) -> tuple[list[str], li
     untrained, trained = [], []
     for tuner in view.style.order:
         costs = [by_tuner[tuner] for by_tuner in costs_by_range if tuner in by_tuner]
+        # A tuner without a run has no costs, and is in neither list.
+        if not costs:
+            continue
+        # Only a training uses simulations before the first target (`fit_simulations`).
         if not any(cost.fit_simulations for cost in costs):
-            if costs:
-                untrained.append(tuner)
+            untrained.append(tuner)
         # The expected running time (ERT) is infinite if no run reaches the error.
         elif any(cost.effort.compute_ert() < float("inf") for cost in costs):
             trained.append(tuner)
@@ -661,6 +664,7 @@ def _count_equal_simulations(first: pd.Series[float], second: pd.Series[float]) 
         first: errors, by number of simulations.
         second: errors of another tuner, by number of simulations.
     """
+    # Numbers of simulations that both curves have.
     points = first.index.intersection(second.index)
     first_errors, second_errors = first[points].to_numpy(), second[points].to_numpy()
     # True up to the first visible difference.
@@ -681,9 +685,11 @@ def format_bin_labels(table: pd.DataFrame) -> list[str]:
     names = []
     for bin_index in range(max(first, default=0) + 1):
         row = first.get(bin_index)
+        # Only group 0, inside the training range, can be without targets.
         if row is None:
             names.append("inside\nn=0")
             continue
+        # Equal limits are written once.
         limits = [f"{row[end]:.2f}" for end in ("beyond", "to")]
         name = "–".join(dict.fromkeys(limits)) if bin_index else "inside"
         names.append(f"{name}\nn={row['targets']}")

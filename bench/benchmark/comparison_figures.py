@@ -345,6 +345,8 @@ def _draw_chart_figure(
     `view`.
     """
     chart, layout = CHARTS[name](view), _LAYOUTS[name]
+    # A facet is a property of a panel that a reader of the page can choose, such as the range. A
+    # printed figure shows all values of two facets, and the first value of any other.
     panels = select_first_panels(chart.panels, (chart.side_by_side, layout.rows))
     # With several rows, there is a column for each value of the facet that is side by side.
     columns = len({panel.facets[chart.side_by_side] for panel in panels}) if layout.rows else 0

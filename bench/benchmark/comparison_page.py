@@ -85,6 +85,9 @@ def collect_text_values(results: ComparisonReportData) -> dict[str, Any]:
 
     Args:
         results: Comparison with its statistics and tables.
+
+    Returns:
+        Values by their names in the templates.
     """
     view = results.view
     return {

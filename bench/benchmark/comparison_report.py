@@ -76,6 +76,10 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
     The summary has the best tuners, their median errors, limitations of the comparison, failures
     and running times.
 
+    Args:
+        folder: folder of the comparison, to which the files are written.
+        print_line: callback that prints one line of the summary.
+
     Returns:
         Number of failed runs.
 
@@ -202,6 +206,8 @@ def _list_error_tables(
     metrics, statistics = set(lines["metric"]), view.statistics
     # The row of a skipped tuner has no range.
     for kind in lines["range"][lines["range"] != ""].unique():
+        # The true parameters of a recording are unknown, so its table has errors of channels. A
+        # single parameter has an absolute error, several have `param_error` only.
         preferred = ("heldout_error", "obs_error") if kind == "real" else ("param_abs_error",)
         metric = next((name for name in preferred if name in metrics), "param_error")
         medians = build_summary(lines, metric, kind, statistics.order_in(kind))
@@ -272,6 +278,10 @@ def format_failures(failed: pd.DataFrame) -> list[str]:
 
     Args:
         failed: Rows of the failed runs, with tuner, status and reason.
+
+    Returns:
+        An empty line, a heading, the aligned lines, and a note on isolation if it may be the cause;
+        no lines without failures.
     """
     lines = [
         (
@@ -301,7 +311,11 @@ _TRACEBACK_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (
 
 
 def format_failure_reason(reason: str) -> str:
-    """Return error and location from a reason, which may be a traceback."""
+    """Return error and location from a reason, which may be a traceback.
+
+    A traceback becomes one line, ``ValueError: MESSAGE (FILE.py, line 7, in FUNCTION)``; of another
+    reason the last line is returned.
+    """
     lines = without_isolation(reason.strip()).splitlines() or [""]
     frames = [i for i, line in enumerate(lines) if _TRACEBACK_FRAME.search(line)]
     if not frames:

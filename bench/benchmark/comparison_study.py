@@ -112,7 +112,7 @@ class Comparison(Study):
         results.hidden_paths = tuple(
             str(path.resolve()) for path in (self.folder, get_weights_folder())
         )
-        ids = [job.request.run for job in results.plan]
+        ids = [planned.request.run for planned in results.plan]
         if not self.is_unfinished:
             finished_ids = [end.name for end in self._list_finished_ends()]
             if finished_ids != ids:
@@ -133,7 +133,7 @@ class Comparison(Study):
         except InputError:
             journal.close()
             raise
-        # The process was killed before it wrote the plan, so there are no runs to compare with it.
+        # A new comparison has no plan yet, nor has one whose process was killed before writing it.
         if planned_ids is None:
             write_plan(self.folder, ids)
         results.run_sink = journal
@@ -153,6 +153,7 @@ class Comparison(Study):
         # The index is the position of the run in the plan.
         statuses.index = list(journal.statuses)
         for indices, rows in journal.iterate_tables():
+            # The rows are those of a chunk of runs; `first_row` numbers them in error messages.
             file = RunsTable(journal.path, JOURNAL_REMEDY, rows, first_row)
             runs = file.read_runs(experiment)
             check_runs(runs, file, experiment)
@@ -197,7 +198,8 @@ class Comparison(Study):
 
         results = self._require_experiment_run()
         journal = results.run_sink
-        if not isinstance(journal, RunJournal):  # the comparison was complete before
+        # Only an unfinished comparison has a journal; nothing is missing in any other.
+        if not isinstance(journal, RunJournal):
             return StudyOutcome(len(results.plan), len(results.plan))
         try:
             run_experiment(results, self.plugins, jobs, progress or no_progress, pool)

@@ -26,9 +26,14 @@ class AffinityController:
     """
 
     def __init__(self) -> None:
-        self._count, self._since = 0, perf_counter()
-        self._home = None if not hasattr(os, "sched_getaffinity") else os.sched_getaffinity(0)
-        self._pinned = False
+        self._exchange_count = 0
+        self._measured_since = perf_counter()
+        self._is_pinned = False
+        self._pinned_until = 0.0
+        # Not every system states on which processors a process may run.
+        self._original_processors = (
+            os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+        )
 
     def record_exchange(self) -> int:
         """Count an exchange of messages, and return a flag that tells the other side where to run.
@@ -40,16 +45,17 @@ class AffinityController:
         Returns:
             0 for no change, `_ANY_PROCESSOR_FLAG`, or n + 1 for processor n.
         """
-        self._count += 1
-        if self._count % _MEASURED_EXCHANGES:
+        self._exchange_count += 1
+        # The decision is made when a further block of exchanges is complete.
+        if self._exchange_count % _MEASURED_EXCHANGES:
             return 0
         now = perf_counter()
-        mean = (now - self._since) / _MEASURED_EXCHANGES
-        self._since = now
-        if self._pinned and (mean > _FAST_EXCHANGE_SECONDS or now > self._until):
+        mean_seconds = (now - self._measured_since) / _MEASURED_EXCHANGES
+        self._measured_since = now
+        if self._is_pinned and (mean_seconds > _FAST_EXCHANGE_SECONDS or now > self._pinned_until):
             self.release_affinity()
             return _ANY_PROCESSOR_FLAG
-        if not self._pinned and mean < _FAST_EXCHANGE_SECONDS:
+        if not self._is_pinned and mean_seconds < _FAST_EXCHANGE_SECONDS:
             return self._pin_to_current_processor(now)
         return 0
 
@@ -61,17 +67,17 @@ class AffinityController:
             processor is unknown or its number does not fit into the flag.
         """
         processor = _read_current_processor()
-        if self._home is None or not 0 <= processor < _ANY_PROCESSOR_FLAG - 1:
+        if self._original_processors is None or not 0 <= processor < _ANY_PROCESSOR_FLAG - 1:
             return 0
         os.sched_setaffinity(0, {processor})
-        self._pinned, self._until = True, now + _REMEASURE_SECONDS
+        self._is_pinned, self._pinned_until = True, now + _REMEASURE_SECONDS
         return processor + 1
 
     def release_affinity(self) -> None:
         """Allow this side to run on its original processors again."""
-        if self._pinned and self._home is not None:
-            os.sched_setaffinity(0, self._home)
-            self._pinned = False
+        if self._is_pinned and self._original_processors is not None:
+            os.sched_setaffinity(0, self._original_processors)
+            self._is_pinned = False
 
 
 def _read_current_processor() -> int:
@@ -86,7 +92,8 @@ def set_processor(flag: int) -> None:
     """Run this process where the harness runs, because alternating is faster on one processor.
 
     Args:
-        flag: result of `AffinityController.record_exchange`, not 0.
+        flag: result of `AffinityController.record_exchange`, not 0: the number of the processor
+            plus one, or `_ANY_PROCESSOR_FLAG`.
     """
     processors = range(os.cpu_count() or 1) if flag == _ANY_PROCESSOR_FLAG else {flag - 1}
     with suppress(OSError, AttributeError):

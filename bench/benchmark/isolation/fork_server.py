@@ -125,10 +125,10 @@ def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: 
     set_parent_death_signal()
     # The fork server ignores this signal; with that, no exit code of a child could be waited for.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    folder, (control, *pipes) = request["folder"], descriptors
+    control, *pipes = descriptors
     layers = [
         *layers,
-        *isolation_layers.mount_empty_folder(folder),
+        *isolation_layers.mount_empty_folder(request["folder"]),
         *isolation_layers.enter_process_namespace(),
     ]
     child = os.fork()
@@ -192,6 +192,7 @@ def _run_service(request: dict[str, Any], pipes: list[int], layers: list[str]) -
     """
     _discard_output()
     reading, writing = (os.dup2(pipe, 100 + i) for i, pipe in enumerate(pipes))
+    # All open files but the standard streams (0 to 2) and the two pipes.
     os.closerange(3, 100)
     os.closerange(102, 4096)
     policy = isolation_layers.AccessPolicy(

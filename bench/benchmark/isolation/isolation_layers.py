@@ -90,7 +90,8 @@ def _list_readable_paths(hidden: tuple[str, ...], packages: tuple[str, ...]) -> 
         site.getusersitepackages(),
         *packages,
     ]
-    # If this project is installed as a wheel, its root is the folder of all packages.
+    # If this project is installed as a wheel, its root is the folder of all packages, and readable.
+    # The root of a source folder is not, because it also has results and tests.
     is_checkout = not (PROJECT_ROOT / "numpy").exists()
     readable_paths = []
     for text in candidates:

@@ -77,6 +77,8 @@ The last one is combined with an error number; with 0 the call does nothing and 
 """
 _EPERM, _ENOMEM, _ENOSYS = _FAIL | 1, _FAIL | 12, _FAIL | 38
 """Verdicts for the errors EPERM, ENOMEM and ENOSYS."""
+_DO_NOTHING = _FAIL | 0
+"""Verdict for a call that does nothing and succeeds: it fails with the error number 0."""
 _CLONE_THREAD = 0x00010000
 """CLONE_THREAD: the new task is a thread of this process."""
 _STREAM_SOCKET_TYPES = tuple(1 | flags for flags in (0, 0x800, 0x80000, 0x80800))
@@ -123,22 +125,28 @@ def list_rules(process: int, has_memory_limit: bool) -> dict[str, int | Argument
         process: process id of the process that is restricted.
         has_memory_limit: True if calls that allocate uncounted memory are blocked too.
     """
-    itself = ArgumentRule(0, {process: _ALLOW}, _EPERM)
+    only_itself = ArgumentRule(0, {process: _ALLOW}, _EPERM)
     rules: dict[str, int | ArgumentRule] = {
+        # The calls of x86_64 include those of all supported machines.
         **dict.fromkeys(_SYSCALL_NUMBERS["x86_64"], _EPERM),
         # Libraries try these first, and use other calls if the kernel reports that they are absent.
         **dict.fromkeys(("clone3", "io_uring_setup"), _ENOSYS),
         "clone": ArgumentRule(0, {_CLONE_THREAD: _ALLOW}, _EPERM, mask=_CLONE_THREAD),
-        "kill": itself,
-        "tgkill": itself,
+        "kill": only_itself,
+        "tgkill": only_itself,
+        # Process 0 means the calling process.
         "prlimit64": ArgumentRule(0, {0: _ALLOW, process: _ALLOW}, _EPERM),
         "prctl": ArgumentRule(0, {PR_SET_PDEATHSIG: _EPERM}, _ALLOW),
         "socketpair": ArgumentRule(1, dict.fromkeys(_STREAM_SOCKET_TYPES, _ALLOW), _EPERM),
         "fcntl": ArgumentRule(
-            1, {**dict.fromkeys(_LOCK_COMMANDS, _FAIL), **dict.fromkeys(_BLOCKED_FCNTL_COMMANDS,
-            _EPERM)}, _ALLOW,
+            1,
+            {
+                **dict.fromkeys(_LOCK_COMMANDS, _DO_NOTHING),
+                **dict.fromkeys(_BLOCKED_FCNTL_COMMANDS, _EPERM),
+            },
+            _ALLOW,
         ),
-        "flock": _FAIL,
+        "flock": _DO_NOTHING,
         "capset": _ALLOW,  # capabilities can only be given up
         **dict.fromkeys(("memfd_create", "memfd_secret", "mmap"), _ALLOW),
     }  # fmt: skip
@@ -153,8 +161,6 @@ def list_rules(process: int, has_memory_limit: bool) -> dict[str, int | Argument
 
 _LOAD, _AND, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x54, 0x15, 0x35, 0x06
 """BPF instructions: load a word, AND, jump if equal, jump if at least, return."""
-_ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
-"""AUDIT_ARCH of each machine; calls with the numbers of another architecture are blocked."""
 _FIRST_X32_CALL = 0x40000000
 """First call number of the x32 interface, which is not used."""
 _NUMBER_OFFSET, _ARCHITECTURE_OFFSET, _ARGUMENTS_OFFSET = 0, 4, 16
@@ -240,7 +246,8 @@ def install_syscall_filter(has_memory_limit: bool = False) -> None:
     machine = platform.machine()
     if not IS_LINUX or machine not in _ARCHITECTURES or sys.byteorder != "little":
         raise OSError(f"no filter for {machine}")
-    # An empty set of capabilities (capset(2)) of this process, which has the number 0.
+    # An empty set of capabilities (capset(2)) of this process, which has the number 0. A set is 24
+    # bytes: effective, permitted and inheritable capabilities, each of 64 bits.
     capability_header = struct.pack("<Ii", _CAPABILITY_VERSION_3, 0)
     call_system(_SYSCALL_NUMBERS[machine]["capset"], capability_header, bytes(24))
     program = build_filter(machine, list_rules(os.getpid(), has_memory_limit))
@@ -250,6 +257,7 @@ def install_syscall_filter(has_memory_limit: bool = False) -> None:
         for code, operand, if_true, if_false in program
     )
     buffer = ctypes.create_string_buffer(packed)
+    # The C structure sock_fprog: number of instructions, padding, address of the first one.
     header = struct.pack("<HxxxxxxQ", len(program), ctypes.addressof(buffer))
     set_no_new_privileges()
     prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, ctypes.create_string_buffer(header))

@@ -136,7 +136,8 @@ class IsolatedProcess:
         self.channel.close()
         code = None if kill else self._wait_for_exit_code(_SHUTDOWN_TIMEOUT_SECONDS)
         if code is None:
-            # The supervisor kills the process.
+            # The supervisor kills the process when this side of the socket is closed. The other
+            # side stays open, so that its report can be awaited.
             with contextlib.suppress(OSError):
                 self._control.shutdown(socket.SHUT_WR)
             self._wait_for_exit_code(START_TIMEOUT_SECONDS)
@@ -185,6 +186,7 @@ class IsolatedProcess:
             raise self.fail_with_protocol_error(str(error)) from None
         except PeerClosedError:
             raise self._make_exit_error() from None
+        # The process reports a failure of the tuner by this message; its text is the traceback.
         if message.kind == b"D":
             raise RunEndedError("crashed", with_isolation(message.to_text()))
         return message
@@ -198,8 +200,10 @@ class IsolatedProcess:
             return NOTHING_WRITTEN
         deadline = perf_counter() + _REPORT_TIMEOUT_SECONDS
         try:
+            # Message ``N`` asks for the number and the first names of the written files.
             self.send(b"N", deadline=deadline)
             report = self.receive(deadline=deadline).to_document()
+            # Code of the tuner may have made the report, so its size is limited.
             count = max(0, min(int(report["count"]), _MAX_REPORTED_FILES))
             return Written(
                 count, tuple(map(_format_file_name, report["names"][:3])) if count else ()
@@ -414,6 +418,10 @@ class IsolatedRun:
         Args:
             task: task of the target.
             deadline: end of the whole run.
+
+        Returns:
+            Points (n, dim), with the tuner's recommendation if it states one; or the reason for
+            which the tuner has stopped.
 
         Raises:
             RunEndedError: the message is not valid, the process failed, or the time limit was

@@ -119,15 +119,16 @@ class RecordingSource:
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """Recording from which explain extends the simulator that is tuned.
+    """Simulated recording from which `simgap explain` extends the simulator that is tuned.
 
-    It is made in the system of the targets, with its own parameters.
+    It is simulated with the system that makes the targets, but with its own parameters.
 
     Attributes:
-        runs: in it.
-        held_out: of them, on which explain measures what a cause brings.
-        initial: initial states where they are others than the targets'.
-        inputs: input signals where they are others than the targets'.
+        runs: number of runs in the recording.
+        held_out: number of these runs on which `simgap explain` measures how much a cause improves
+            the prediction.
+        initial: initial states that differ from those of the targets.
+        inputs: input signals that differ from those of the targets.
     """
 
     runs: int = 6
@@ -476,9 +477,15 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
 
     Relative paths are made absolute, and names of tuners and swept values are checked.
 
+    Args:
+        name: name of the experiment.
+        document: tables of the file.
+        path: path of the file, for messages and for relative paths.
+
     Raises:
         InputError: there is an unknown key or a value of a wrong type; names file and key.
     """
+    # The keys of a file are the fields of an experiment; their types are checked below.
     hints = {key: hint for key, hint in get_type_hints_of(Experiment).items() if key != "name"}
     check_known_names(f"entry of {path}", document, hints)
     tuners = parse_entries(path, document.get("tuners", {}))
@@ -557,10 +564,16 @@ _UNHASHED_KEYS = (*SHARED_KEYS, "title", "says", "identifiable", "tags")
 
 
 def _load_named_experiments(suite: Experiment, name: str) -> list[Experiment]:
-    """Return an experiment that another one names, with the numbers and tuners of the latter.
+    """Load one of the experiments that a suite names, with the numbers and tuners of the suite.
 
-    This is how one file, such as a suite, runs many problems with the same settings. `suite` is
-    the experiment that names others, and `name` one of these.
+    This is how one file runs many problems with the same settings.
+
+    Args:
+        suite: experiment that names others.
+        name: one of these, a name or the path of a file.
+
+    Returns:
+        The experiment; one for each combination if it sweeps over values.
 
     Raises:
         InputError: the named experiment names others itself, or it is not the suite's version.
@@ -586,8 +599,8 @@ def _resolve_experiment_path(name: str, experiment: Path) -> str:
 def _expand_combinations(experiment: Experiment, path: Path) -> list[Experiment]:
     """Expand a sweep to one experiment for each combination of values.
 
-    An experiment without a sweep is returned alone. Each combination is named
-    ``NAME[key=value,...]``. `path` is only used in error messages.
+    A sweep lists several values of one or more keys. An experiment without a sweep is returned
+    alone. Each combination is named ``NAME[key=value,...]``. `path` is only used in error messages.
     """
     if not experiment.sweep or experiment.experiments:
         return [experiment]

@@ -80,7 +80,9 @@ def _make_observed_runs(
 def make_scenario(run: Run, simulator: Simulator, constants: Mapping[str, float]) -> Scenario:
     """Convert a recorded run to a scenario.
 
-    The run starts in the first measured state unless it specifies an initial state.
+    The run starts in the first measured state unless it specifies an initial state. The scenario
+    also says which inputs are interpolated linearly, how much they are delayed (`offset`, in s),
+    and when actuators are switched off (`off`).
 
     Args:
         run: recorded run.

@@ -46,6 +46,7 @@ def get_simulator_class(experiment: Experiment) -> type[Simulator]:
     path = find_model(experiment.model, experiment.name)
     free_names, actuators, engine = experiment.free, dict(experiment.actuators), {}
     if experiment.recording:
+        # The description of the recording refers to a model, with what the model file lacks.
         reference = read_model_reference(find_recording(experiment.recording.path), path)
         assert reference is not None  # a model was given
         actuators, engine = {**reference.actuators, **actuators}, dict(reference.engine)

@@ -167,17 +167,19 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
         number: 0 for the first draw; counts the repeated draws, each from new streams.
     """
     # The stream's name contains no tuner, seed or budget, so that all tuners get the same target.
-    # Start, true parameters, scenario and noise have a stream each.
+    # With a secret salt, start, true parameters, scenario and noise have a stream each.
     experiment_name = problem.experiment.same_targets_as or problem.experiment.name
     redraw_names = ("redraw", number) if number else ()
     streams = TargetStreams(problem.salt, experiment_name, kind, index, *redraw_names)
     box = _CUBE_CORNERS if kind == "wide" else problem.cube.training
+    # The start is drawn first: with a public salt, all quantities share one stream.
     start, truth = (
         streams.get_stream(stream_name).uniform(box[0], box[1], size=problem.cube.dim)
         for stream_name in ("start", "truth")
     )
     name = f"{kind}-{index:03d}"
     recording = problem.recording
+    # The true parameters of a recording are not known; only the start is drawn.
     if recording:
         return Target(BlindedTarget(name, kind, start, recording.fitting, recording.held_out), None)
     # This is one scenario, because only recordings have several runs.
@@ -240,14 +242,14 @@ def draw_scenario(
     Args:
         experiment: configuration with the sampling and the constants.
         rng: random generator for values that are given as a range.
-        initial: initial state.
-        inputs: descriptions of the input signals.
+        initial: initial state by name: a number, or the range from which it is drawn.
+        inputs: descriptions of the input signals by name, such as ``sine:2:0.5``.
     """
     sampling = experiment.sampling
     start = {name: _draw_value(rng, value) for name, value in initial.items()}
     times = np.arange(sampling.samples) / sampling.rate
     signals = {name: evaluate_signal(text, times, rng) for name, text in inputs.items()}
-    # Constants that are equal in every scenario are set in the simulator.
+    # Only constants with a range are drawn; the others are set in the simulator.
     ranges = {name: v for name, v in experiment.constants.items() if isinstance(v, tuple)}
     constants = {name: _draw_value(rng, value) for name, value in ranges.items()}
     return Scenario(times, start, signals, constants)

@@ -126,8 +126,9 @@ class RandomisedSimulator:
     def __init__(self, problem: TuningProblem) -> None:
         """Build the simulator with one more effect for every effect named in the [nuisance] table.
 
-        `ranges` are the bounds from which each coefficient is drawn, by ``effect.coefficient``. The
-        coefficients become parameters of the simulator after the tuned ones.
+        This table of the experiment states the bounds from which each coefficient is drawn, by
+        ``effect.coefficient``. The coefficients become parameters of the simulator after the tuned
+        ones.
 
         Args:
             problem: problem that a tuner trains on.
@@ -153,8 +154,8 @@ class RandomisedSimulator:
             )
         except (InputError, TypeError) as error:
             raise InputError(f"{location}: {error}") from None
-        tuned = len(problem.simulator.parameters)
-        self._ranges = _order_bounds(location, self._simulator, tuned, ranges)
+        tuned_count = len(problem.simulator.parameters)
+        self._bounds = _order_bounds(location, self._simulator, tuned_count, ranges)
 
     def simulate(
         self, rng: np.random.Generator, points: Array, scenarios: tuple[Scenario, ...]
@@ -186,7 +187,7 @@ class RandomisedSimulator:
         Returns:
             (count, coefficients) values.
         """
-        low, high = self._ranges
+        low, high = self._bounds
         samples = rng.uniform(low, high, size=(count, len(low)))
         has_effect = rng.random((count, 1)) >= NO_EFFECT_SHARE
         coefficients: Array = np.where(has_effect, samples, 0.0)
@@ -206,20 +207,24 @@ def _get_effect_name(name: str) -> str:
 
 
 def _order_bounds(
-    location: str, simulator: Simulator, tuned: int, ranges: Mapping[str, tuple[float, float]]
+    location: str, simulator: Simulator, tuned_count: int, ranges: Mapping[str, tuple[float, float]]
 ) -> tuple[Array, Array]:
-    """Return lower and upper bounds in the simulator's order; zero for coefficients not named.
+    """Return lower and upper bounds of random coefficients in the simulator's order.
 
     Args:
         location: entry of the experiment file, for messages.
         simulator: simulator whose parameters after the tuned ones are randomised.
-        tuned: number of tuned parameters, which come first.
+        tuned_count: number of tuned parameters, which come first.
         ranges: lower and upper bound by name of the coefficient.
+
+    Returns:
+        Lower and upper bounds, each (coefficients,); both are zero for a coefficient that `ranges`
+        does not name, which switches it off.
 
     Raises:
         InputError: a name is unknown.
     """
-    names = [parameter.name for parameter in simulator.parameters[tuned:]]
+    names = [parameter.name for parameter in simulator.parameters[tuned_count:]]
     for name in ranges:
         if name not in names:
             raise InputError(f"{location}: expected one of {', '.join(names)}, found {name}")

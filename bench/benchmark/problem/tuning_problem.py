@@ -212,6 +212,10 @@ class TuningProblem:
 
         Args:
             scenarios: Runs of the task, each with initial values, constants and inputs.
+
+        Returns:
+            Numbers of all runs, one run after the other, and inputs (T, U) of U signals, with the
+            runs concatenated along the samples T.
         """
         observed_names = {c.name for c in self.channels}
         initial: list[float] = []
@@ -222,7 +226,7 @@ class TuningProblem:
             numbers = sorted({**hidden, **scenario.constants}.items())
             initial += [value for _, value in numbers]
             signals = np.array([values for _, values in sorted(scenario.inputs.items())])
-            # A scenario without inputs has T samples of zero signals.
+            # A scenario without inputs gives an array (T, 0).
             inputs.append(signals.reshape(-1, scenario.times.size).T)
         return ScenarioInfo(np.array(initial, dtype=np.float64), np.concatenate(inputs))
 

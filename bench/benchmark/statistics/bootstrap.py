@@ -68,7 +68,7 @@ def draw_resample_counts(n: int, resamples: int, rng: np.random.Generator) -> Re
         (n, resamples) counts.
     """
     indices = rng.integers(n, size=(resamples, n))
-    # Numbers of each resample in a range of its own, so that all are counted at once.
+    # The indices of resample r are moved to n r ... n r + n - 1, so that one call counts all.
     indices += n * np.arange(resamples)[:, None]
     counts = np.bincount(indices.ravel(), minlength=resamples * n)
     return np.ascontiguousarray(counts.reshape(resamples, n).T.astype(np.min_scalar_type(n)))

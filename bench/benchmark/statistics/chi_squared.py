@@ -63,6 +63,7 @@ def chi_squared_quantile(freedom: int, tail: float) -> float:
     # The tail falls with the statistic: double the upper bound until the quantile is below it.
     while chi_squared_tail(freedom, high) > tail:
         low, high = high, 2.0 * high
+    # The loop ends when no float is left between both bounds.
     while low < (middle := (low + high) / 2.0) < high:
         if chi_squared_tail(freedom, middle) > tail:
             low = middle

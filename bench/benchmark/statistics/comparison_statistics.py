@@ -133,7 +133,10 @@ class ComparisonStatistics:
 
     @cached_property
     def notes(self) -> dict[str, str]:
-        """Notes of legends and tables about tuners with failed runs, by tuner."""
+        """Notes of legends and tables about tuners with failed runs, by tuner label.
+
+        Tuners without failed runs have no entry.
+        """
         failed = pd.Series(self._all_runs.failed).groupby(self._all_runs.keys["tuner"], sort=False)
         return {
             str(tuner): "all runs failed"
@@ -146,15 +149,19 @@ class ComparisonStatistics:
     def get_error_floor(self, metric: str) -> float | None:
         """Return the error below which tuners count as equal, in the unit of a metric.
 
-        The absolute error of a single parameter decides too, in its own unit.
+        The absolute error of a single parameter (`param_abs_error`) is its relative error
+        (`param_error`) in another unit, so it decides too if the relative error does.
+
+        Args:
+            metric: name of the metric.
 
         Returns:
             Error; None for a metric that does not decide the comparison.
         """
         if metric == self.metric:
             return self.floor
-        is_deciding_metric = self.metric == "param_error" and metric == "param_abs_error"
-        return self.floor * self.unit if is_deciding_metric else None
+        is_same_error = self.metric == "param_error" and metric == "param_abs_error"
+        return self.floor * self.unit if is_same_error else None
 
     def format_label(self, tuner: str) -> str:
         """Return the tuner's name, with its number of failed runs if there are any."""
@@ -215,13 +222,15 @@ class ComparisonStatistics:
 
     @cached_property
     def medians_by_distance(self) -> pd.DataFrame:
-        """Errors by distance from the training range.
+        """Errors by distance from the training range, for targets of the range `wide`.
 
         See `error_curves.compute_medians_by_distance`.
         """
-        first = self.select_range("wide").drop_duplicates("target").set_index("target")["outside"]
+        # All rows of a target have the same distance, so the first one is used.
+        wide_targets = self.select_range("wide").drop_duplicates("target").set_index("target")
+        distances = wide_targets["outside"].sort_index()
         curves = self._get_curves_of_all_runs(self.parameter_error_metric).select(range="wide")
-        return compute_medians_by_distance(curves, first.sort_index(), self._budget)
+        return compute_medians_by_distance(curves, distances, self._budget)
 
     @cached_property
     def runtime_distribution(self) -> pd.DataFrame:
@@ -244,6 +253,9 @@ class ComparisonStatistics:
         """Compute what each tuner costs to reach an error threshold, by range and then by tuner.
 
         Costs are the simulations, the seconds in the tuner and in the simulator, and the training.
+
+        Args:
+            level: error threshold of the deciding metric.
         """
         in_tuner = self._rows.build_cumulative_seconds("tuner_seconds")
         in_simulator = self._rows.build_cumulative_seconds("simulator_seconds")
@@ -320,7 +332,9 @@ def build_tables(
         statistics: statistics of the comparison; None to compute them.
 
     Returns:
-        Tables by name; empty without a run.
+        Tables by name; no table without a run. ``table`` has the errors, ``ert`` the expected
+        running times, ``pairs`` the tests of all pairs of tuners, ``break_even`` the numbers of
+        targets from which a training pays, ``who_wins`` the fastest tuners.
     """
     if stored.runs.empty:
         return {}

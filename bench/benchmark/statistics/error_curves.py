@@ -209,6 +209,8 @@ class PrimaryMetric(NamedTuple):
 def select_primary_metric(runs: pd.DataFrame) -> PrimaryMetric:
     """Select the metric that decides a comparison.
 
+    Directions are combinations of parameters: the data determine stiff ones well, sloppy ones not.
+
     * If some target has sloppy directions, it is the error along stiff directions, because the data
       do not determine the others. A target without a stiff direction is then left out.
     * Otherwise it is the parameter error if the true parameters are known, else the error on

@@ -143,7 +143,8 @@ def compute_effort(
         curves: curves of one tuner and range.
         threshold: threshold of the metric.
         budget: number of simulations that a failed run counts with.
-        tuner_seconds: (R, K + 1) cumulative seconds in the tuner; None if they are not needed.
+        tuner_seconds: (R, K + 1) cumulative seconds in the tuner of R runs after 0 to K
+            simulations; None if they are not needed.
     """
     times = compute_hitting_times(curves, threshold)
     success = np.isfinite(times)

@@ -96,8 +96,8 @@ def correct_holm(p: Array) -> Array:
     # statsmodels' `multipletests` takes a second to import and collects all garbage in each call.
     order = np.argsort(p)[: np.count_nonzero(~np.isnan(p))]
     corrected: Array = np.full(len(p), np.nan)
-    raised = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))
-    corrected[order] = np.minimum(raised, 1.0)
+    multiplied = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))
+    corrected[order] = np.minimum(multiplied, 1.0)
     return corrected
 
 

@@ -138,9 +138,10 @@ def compute_break_even_targets(
         Number of targets; 0 where the search tuner never reaches the threshold, infinite where
         training never pays.
     """
-    # Solved for n: fit / (ert_search - ert_learned).
+    # Solved for n: fit / (ert_search - ert_learned). If the search tuner never reaches the
+    # threshold, its ERT is infinite, and n is 0.
     never_succeeds = np.isinf(learned.effort.compute_ert(picked))
-    # The difference is NaN or not positive if both tuners fail or need the same number.
+    # Training never pays if the saving is not positive, or NaN because both tuners fail.
     with np.errstate(invalid="ignore", divide="ignore"):
         saving = search.effort.compute_ert(picked) - learned.effort.compute_ert(picked)
         result: Array = np.where(

@@ -85,10 +85,13 @@ def list_ranking_points(budget: int) -> list[int]:
 
 
 def compute_min_targets(comparison_count: int) -> int:
-    """Return how many targets can decide `comparison_count` comparisons with the best tuner.
+    """Return the minimum number of targets that can decide all comparisons with the best tuner.
 
-    The smallest two-sided p-value of Wilcoxon's signed-rank test on n pairs is 2 / 2^n; Holm's
-    first step multiplies it by the number of comparisons.
+    The smallest two-sided p-value of Wilcoxon's signed-rank test on n pairs is 2 / 2^n = 2^(1-n);
+    Holm's first step multiplies it by the number of comparisons.
+
+    Args:
+        comparison_count: number of tuners that are compared with the best one.
     """
     return next(n for n in itertools.count(1) if 2.0 ** (1 - n) * comparison_count < SIGNIFICANCE)
 
@@ -173,7 +176,8 @@ def _build_verdict_rows(
 
     The best is the first tuner that has a successful run. The test is Wilcoxon's signed-rank test
     over targets with Holm's correction for several tests. A tuner is WORSE if the difference is
-    significant, EQUAL if it shares the first rank, and otherwise UNDECIDED.
+    significant, EQUAL if it shares the first rank, FAILED if all its runs failed, and otherwise
+    UNDECIDED.
 
     Args:
         ranking: tuners in the order of their median errors.
@@ -345,6 +349,7 @@ def compute_kendall_tau(first: Array, second: Array) -> float:
     """
     from scipy.stats import kendalltau
 
+    # Rounding makes numbers equal that differ in their last digits only.
     return float(kendalltau(np.round(first, 9), np.round(second, 9)).statistic)
 
 
@@ -359,9 +364,12 @@ def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgre
         first: (targets, tuners) errors in the first condition.
         second: (targets, tuners) errors in the second condition.
         names: names of the comparison, which determine the random stream.
+
+    Returns:
+        Tau with its interval and p-value, and tau between halves of the targets for comparison.
     """
     rng = make_rng("agreement", *names)
-    # (2, targets, tuners)
+    # The shape is (2, targets, tuners).
     ranks = np.stack([_rank_within_targets(first), _rank_within_targets(second)])
     count = ranks.shape[1]
     # Tau of the mean ranks (tuners,) in both conditions.
@@ -393,10 +401,13 @@ def _compute_permutation_p_value(changes: Array, rng: np.random.Generator) -> fl
         rng: source of the permutations.
     """
     signs = rng.choice([-1.0, 1.0], size=(PERMUTATION_COUNT, len(changes)))
-    sums = ((signs @ changes) ** 2).sum(axis=1)
+    # Sums over targets take the place of means, which differ by a constant factor only.
+    permuted = ((signs @ changes) ** 2).sum(axis=1)
     observed = (changes.sum(axis=0) ** 2).sum()
+    # An equal statistic may differ by rounding.
+    extreme_count = (permuted >= observed * (1 - 1e-12)).sum()
     # The observed statistic is one of the permutations, so p is at least 1 / (n + 1).
-    return float((1 + (sums >= observed * (1 - 1e-12)).sum()) / (1 + PERMUTATION_COUNT))
+    return float((1 + extreme_count) / (1 + PERMUTATION_COUNT))
 
 
 def _compute_mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> float:

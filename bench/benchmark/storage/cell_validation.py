@@ -88,12 +88,13 @@ def parse_parquet_column(column: ColumnSpec, values: pa.ChunkedArray) -> pa.Arra
     except pa.ArrowInvalid as error:
         raise CellError(None, column.name, column.expected_text, get_first_line(error)) from None
     kind = values.type
+    # A dictionary-encoded column stores each different value once; it is expanded.
     if pa.types.is_dictionary(kind):
         values = values.cast(kind.value_type)
         kind = values.type
-    text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+    is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
     is_convertible: Mapping[type, bool] = {
-        str: text,
+        str: is_text,
         int: pa.types.is_integer(kind),
         float: pa.types.is_floating(kind) or pa.types.is_integer(kind),
         bool: pa.types.is_boolean(kind),
@@ -154,6 +155,7 @@ def parse_json_column(column: ColumnSpec, values: Sequence[Any]) -> pa.Array:
     kinds = (int, float) if column.kind is float else (column.kind,)
     for row, value in enumerate(values):
         is_null = value is None and column.kind is float  # JSON has no NaN.
+        # For Python, True and False are whole numbers too.
         is_wrong_bool = isinstance(value, bool) and column.kind is not bool
         if not is_null and (is_wrong_bool or not isinstance(value, kinds) or _exceeds_int64(value)):
             raise CellError(row, column.name, column.expected_text, format_value(value))

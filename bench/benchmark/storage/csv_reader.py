@@ -119,19 +119,26 @@ class CsvTable:
         return pa.table(typed)
 
     def _read_cells(self) -> pa.Table:
-        """Read every cell as text."""
+        """Read every cell as text.
+
+        Raises:
+            InputError: the text cannot be split into rows with the cells of the header.
+        """
         import pyarrow as pa
         from pyarrow import csv as arrow
 
         data = self._text.encode()
-        texts = {name: pa.large_string() for name in self._header}
+        text_types = {name: pa.large_string() for name in self._header}
         try:
             return arrow.read_csv(
                 pa.BufferReader(data),
                 # One block, since a text cell may be longer than any block.
                 arrow.ReadOptions(block_size=min(len(data) + 1, 2**31 - 1), use_threads=False),
                 arrow.ParseOptions(newlines_in_values=True),
-                arrow.ConvertOptions(column_types=texts, null_values=[], strings_can_be_null=False),
+                # No text means a missing value; an empty cell stays an empty text.
+                arrow.ConvertOptions(
+                    column_types=text_types, null_values=[], strings_can_be_null=False
+                ),
             )
         except pa.ArrowException as error:
             self._refuse_ragged()
@@ -169,6 +176,7 @@ class CsvTable:
         lines = (
             number for index, (number, _) in enumerate(self._iterate_records()) if index == row + 1
         )
+        # A file without this row has no line for it; the number is that of a file of single lines.
         return next(lines, row + 2)
 
 
@@ -265,6 +273,10 @@ def _read_checked_runs(
         read_columns: Reads columns by their names.
         names: Names of the columns.
         experiment: Experiment of the runs.
+
+    Returns:
+        One line per run: its constant columns, ``row``, at which it begins, and ``used``, its last
+        k.
 
     Raises:
         CellError: A cell or a run violates its declaration.

@@ -36,9 +36,10 @@ def list_package_versions() -> dict[str, str]:
 
 
 def _name_and_version(distribution: Distribution) -> tuple[str, str]:
-    """Read name and version from the head of the metadata.
+    """Read name and version of a package from the head of its metadata.
 
-    Parsing all of it takes 20 times as long.
+    Only the part before the first empty line is read, because parsing all of it takes 20 times as
+    long. If name or version is not found there, the slow way is used.
     """
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
     lines = text.partition("\n\n")[0].splitlines()

@@ -223,6 +223,7 @@ def write_results(
             # The first table defines the columns.
             writer = writer or parquet.ParquetWriter(partial, rows.schema, compression="zstd")
             writer.write_table(rows)
+        # Without any run there are no columns, but the file must exist.
         if writer is None:
             parquet.write_table(pa.table({}), partial)
         else:
@@ -273,6 +274,7 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
 
     experiment = read_configuration(folder).experiment
     path = folder / "runs.parquet"
+    # The segments, the plan and the journal of finished runs, are deleted when all is complete.
     is_unfinished = (folder / SEGMENTS_FOLDER).exists()
     # The study was killed before its first results were written, so nothing is damaged.
     if not path.exists() and is_unfinished:
@@ -290,6 +292,7 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
         if columns is None or name in columns or name.startswith(prefixes)
     ]
     runs = parquet.read_table(path, columns=read_names).to_pandas()
+    # A file without runs has no columns, and none are added.
     return StoredComparison(
         experiment,
         _add_missing_columns(runs, RUN_COLUMNS, columns) if stored_names else runs,

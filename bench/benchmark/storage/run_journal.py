@@ -108,14 +108,15 @@ def read_records(path: Path) -> Iterator[JournalRecord]:
         return
     with path.open("rb") as file:
         file_size = path.stat().st_size
+        # A header of zeros is what a crash of the machine left.
         while len(header := file.read(_RECORD_HEADER.size)) == _RECORD_HEADER.size and any(header):
             mark, head_size, rows_size, checksum = _RECORD_HEADER.unpack(header)
             payload = file.read(head_size + rows_size) if mark == _RECORD_MARK else b""
-            # The last record was cut off.
+            # The file ends within this record, so it is the last one and was cut off.
             if mark == _RECORD_MARK and len(payload) < head_size + rows_size:
                 return
             if mark != _RECORD_MARK or zlib.crc32(payload) != checksum:
-                # The last record was not written completely.
+                # Nothing follows, so it is the last record, which was not written completely.
                 if file.tell() >= file_size:
                     return
                 raise _make_damage_error(path, f"a record before byte {file.tell()}, found damage")
@@ -231,7 +232,7 @@ class RunJournal:
         """Lock the folder against other processes, and recover all runs that it contains.
 
         `_row_extents` has the position and the length in bytes of the rows of each run, which stay
-        on disk.
+        on disk. `_end` is the position at which the next record begins.
 
         Args:
             folder: folder of the comparison.

@@ -46,6 +46,7 @@ def draw_salt_if_needed(experiment: Experiment, salt: str | None) -> tuple[Exper
     secret = generate_salt() if salt is None else salt
     if not secret:
         raise InputError("salt: expected a text, found none; leave it out for a fresh one")
+    # There is no earlier hash (""), so this only checks the length of the salt.
     check_commitment("salt", secret, "")
     return experiment.chosen(salt_sha256=compute_commitment(secret)), secret
 

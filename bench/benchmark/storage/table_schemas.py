@@ -78,6 +78,7 @@ class ColumnSpec:
         number = "a whole number" if self.kind is int else "a number"
         if self.low == -math.inf:
             return number
+        # This upper limit, or none, excludes no sensible number, so it is not mentioned.
         if self.high >= _MAX_EXACT_INTEGER:
             return f"{number} of at least {self.low:g}"
         return f"{number} from {self.low:g} to {self.high:g}"
