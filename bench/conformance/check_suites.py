@@ -102,6 +102,9 @@ def parametrize(*subjects: type) -> pytest.MarkDecorator:
     that it needs has failed. A check in the subject's `known_failures` is expected to fail, and
     counts as failed if it passes.
 
+    Args:
+        subjects: classes to be checked: tuners, simulators, effects or diagnosers.
+
     Raises:
         InputError: a subject is not a tuner, simulator, effect or diagnoser.
     """
@@ -125,7 +128,7 @@ def _bind_check(check: Check, subject: type, failed: set[Check]) -> Callable[[],
     """Bind a check to its subject, as a test without arguments.
 
     Args:
-        check: check function; its docstring is its title.
+        check: check function.
         subject: a class.
         failed: failed checks of this subject; this check is added if it fails.
     """
@@ -348,10 +351,11 @@ def _run_all_checks(
                     "not tested", "the process of other checks ended or was killed"
                 )
             elif check in _MULTIPROCESS_CHECKS:
-                # This check runs the subject in this process too; earlier checks have shown that
-                # this is safe.
+                # A check that starts workers itself cannot run in one. It runs the subject in this
+                # process too; earlier checks have shown that this is safe.
                 result = run_check(kind, name, check)
             else:
+                # One call gives exactly one pair of index and result.
                 ((_, result_or_error),) = pool.iterate_results(
                     [(run_check, (kind, name, check))], CALL_TIMEOUT_SECONDS
                 )

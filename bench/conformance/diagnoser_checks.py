@@ -100,6 +100,9 @@ def _open_case(
         hidden: whether the recording has a hidden cause (strong linear drag).
         budget: maximum number of simulations.
         missing: whether the recording has gaps.
+
+    Yields:
+        The case; within the block, the simulations of this process are counted and limited.
     """
     simulated = _get_recording(hidden)
     with tempfile.TemporaryDirectory() as folder:
@@ -142,7 +145,11 @@ def _add_gaps(recording: Recording) -> Recording:
 
 
 def _get_trained_state(kind: type[Diagnoser]) -> dict[str, Array]:
-    """Train a diagnoser with a small budget, once per process."""
+    """Train a diagnoser with a small budget, once per process.
+
+    Returns:
+        Learned arrays by name; empty for a diagnoser that does not learn.
+    """
     if not kind.learned:
         return {}
     if kind not in TRAINED_DIAGNOSERS:
@@ -176,13 +183,13 @@ class _Run(NamedTuple):
 
     Attributes:
         answer: the answer.
-        foreign: named effects that the recording could not show.
+        unobservable: named effects that the recording cannot show.
         changed: whether the recording or its files were changed.
         random_state_error: description of changes of the global random state; empty for none.
     """
 
     answer: Answer
-    foreign: tuple[str, ...]
+    unobservable: tuple[str, ...]
     changed: bool
     random_state_error: str
 
@@ -212,9 +219,11 @@ def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) 
             # With an answer, the error is that of the random state, which one check reports.
             random_state_error = str(error)
         assert answer is not None
-        names = {name for group in list_named_sets(answer) for name in group}
-        foreign = tuple(sorted(names - set(case.library)))
-        return _Run(answer, foreign, _copy_case_bytes(case) != files_before, random_state_error)
+        named_effects = {name for group in list_named_sets(answer) for name in group}
+        # The library of the case has the effects that the recording can show.
+        unobservable = tuple(sorted(named_effects - set(case.library)))
+        has_changed = _copy_case_bytes(case) != files_before
+        return _Run(answer, unobservable, has_changed, random_state_error)
 
 
 def _run_diagnoser(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
@@ -249,6 +258,7 @@ def check_answers(kind: type[Diagnoser]) -> None:
     """Check that the diagnoser answers about a recording with a cause, and about one without."""
     for hidden in (True, False):
         answer = _diagnose_cached(kind, hidden).answer
+        # These two verdicts say that there is a cause, and must name it.
         empty = answer.verdict in ("named", "ambiguous") and not answer.causes
         check(not empty, "causes where something is named", answer.document(), kind.__name__)
 
@@ -256,7 +266,7 @@ def check_answers(kind: type[Diagnoser]) -> None:
 def check_names_what_there_is(kind: type[Diagnoser]) -> None:
     """Check that named effects are observable in the recording, and occur once in a set."""
     run, location = _diagnose_cached(kind), f"{kind.__name__}.diagnose"
-    check(not run.foreign, "names of case.library", run.foreign, location)
+    check(not run.unobservable, "names of case.library", run.unobservable, location)
     sets_with_repeats = [
         names for names in list_named_sets(run.answer) if len(set(names)) < len(names)
     ]

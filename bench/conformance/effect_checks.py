@@ -98,6 +98,7 @@ def _make_scenario(system: type[System]) -> Scenario:
     # Initial values of states that are neither coordinates nor rates, such as levels, are among the
     # rates.
     initial = dict.fromkeys(system.rates, 0.7) | dict.fromkeys(system.coordinates, 0.4)
+    # A system that strikes the ground with its last coordinate starts above it.
     if system.bounces:
         initial[system.coordinates[-1]] = 2.0
     # Both signs and a change every 0.4 s, so that dead bands, delays and lags are observable.
@@ -181,9 +182,12 @@ def _compute_contributions(
 
     Args:
         active_effect: the effect, with one of the hooks of its kind.
-        c: coefficients of zero, (K, 2, 1) for two batch elements.
+        c: (K, 2, 1) values of the K coefficients for two batch elements, all zero.
         host: simulator, which declares constants and inputs.
         system: system on which the effect acts.
+
+    Returns:
+        Pairs of arrays that must be equal bit for bit; none for an effect with a hidden state.
     """
     moment = _make_state_snapshot(host, system)
     # Arbitrary impact speeds (m/s), restitutions, signals and times (s) of two batch elements.
@@ -240,6 +244,12 @@ def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | Non
     Each system is simulated at 0.05, 0.3 and 0.7 of the plausible range. The observations must
     change at one of them at least, because a limit acts only at the low end of its range; those at
     0.7 must be finite.
+
+    Args:
+        effect: Effect class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
     """
     hosts = list(_find_supporting_systems(effect))
     for host in hosts:

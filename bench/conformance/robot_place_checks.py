@@ -99,6 +99,8 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
     for effect_class in classes:
         location = f"{effect.__name__} at {effect_class.place or 'the world'}"
         c = np.zeros((len(effect_class.coefficients), 2, 1))
+        # A family of effects, such as friction in all joints, has one part for each place; any
+        # other effect is its only part.
         for part, coefficients in effect_class().parts(c):
             has_no_influence = _acts_on(part, coefficients, kind) == ()
             check(has_no_influence, "no contribution at zero", "one", location)
@@ -154,6 +156,7 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
             other_channels = [i for i, name in enumerate(OBSERVED_CHANNELS) if name != signal]
             is_unchanged = not changed[other_channels].any()
             check(is_unchanged, "other channels unchanged", "changes", location)
+        # A family of effects has one part for each place; any other effect is its only part.
         for part, coefficients in effect_class().parts(
             np.ones((len(effect_class.coefficients), 2, 1))
         ):
@@ -252,7 +255,7 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
 
     Args:
         effect: effect of the library: a force, friction, input, sensor or contact law.
-        c: coefficients, (K, 2, 1).
+        c: (K, 2, 1) values of its K coefficients for two batch elements.
         kind: simulator class of the robot.
 
     Returns:
@@ -260,8 +263,10 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
     """
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
+    # `of` is the name of the effect in the library, without its place.
     if effect.of in MODEL_FIELD_EFFECTS and isinstance(effect, ModelValueEffect | Force | Friction):
         return _find_changed_fields(effect, c, kind)
+    # Coefficients `between` are those of an element in series between a drive and its load.
     if isinstance(effect, HiddenStateEffect) and effect.between:
         return _find_series_joint_fields(effect, c, kind)
     if isinstance(effect, Force | Friction | HiddenStateEffect):
@@ -349,8 +354,12 @@ def _find_forced_coordinates(
 ) -> tuple[object, ...]:
     """Return the coordinates on which an effect exerts a force or friction.
 
-    The effect is called at one state in motion. `c` are its coefficients (K, 2, 1), `kind` is the
-    simulator class of the arm. A force is shown by the indices of joints, a friction by its name.
+    The effect is called at one state in motion. `c` are the values of its K coefficients for two
+    batch elements (K, 2, 1), `kind` is the simulator class of the arm.
+
+    Returns:
+        Indices of the joints on which a force acts, or the name of the coordinate with friction;
+        empty if nothing acts.
     """
     from sims.robot.dynamics.effect_forces import make_snapshot
 

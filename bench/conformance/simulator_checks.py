@@ -61,6 +61,7 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
         for _ in range(2):  # before and after the first step
             observation = simulator.observe()
             for name in dict.fromkeys([*names, *kind.coordinates, *kind.rates, *kind.levels]):
+                # It raises an InputError unless the value is a number.
                 observed(simulator, observation, name)
             if has_inertia:
                 _check_inertia(kind, get_checked_inertia(simulator))
@@ -161,7 +162,13 @@ def _compute_scaled_change(simulator: OwnSimulator, seconds: float, steps: int) 
 def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
     """Check that a force along each coordinate changes the motion, and acts for one step only.
 
-    It must not act in the next run.
+    It must not act in the next run either.
+
+    Args:
+        kind: Simulator class under test; the check applies to an `OwnSimulator` with `apply_force`.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
     """
     if not issubclass(kind, OwnSimulator):
         return _NOT_OWN
@@ -187,7 +194,8 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
         is_restored = is_bitwise_equal(unforced, _simulate_motion(simulator, None))
         reset = f"{kind.__name__}.reset: it must remove a force that was applied"
         check(is_restored, "the same run after one with forces", "another", reset)
-        # Rates follow the coordinates. A force that acts on would change the rate more and more.
+        # The columns are the coordinates, then their rates. Row 1 is the state after the first
+        # step, in which the force acts. A force that acts on would change the rate more and more.
         rate_change = np.abs(forced - unforced)[:, len(kind.coordinates) + coordinate]
         has_grown = 0.0 < rate_change[1] * _GROWTH_RATIO < rate_change[_CHECKED_STEP]
         expected = f"a force along {name} to act in the next step alone"
@@ -197,7 +205,9 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
 
 
 def _simulate_motion(simulator: OwnSimulator, force: Array | None) -> Array:
-    """Simulate coordinates and rates (K + 1, 2 D) of a run; the force acts in its first step.
+    """Simulate coordinates and rates of a run without inputs; the force acts in its first step.
+
+    Shapes: K steps, D coordinates.
 
     Args:
         simulator: Simulator written by a user, which is stepped here one step at a time.
@@ -513,6 +523,7 @@ def check_every_parameter_shows(kind: type[Simulator]) -> None:
     points = np.tile(low + 0.4 * (high - low), (1 + cube.dim, 1))
     # One point for each parameter, changed in that direction alone.
     points[1:] += 0.2 * np.diag(high - low)
+    # 600 samples at 60 Hz are ten seconds.
     inputs = {c.name: np.ones(600) for c in simulator.inputs}
     observations = simulator.simulate(
         cube.to_physical(points), Scenario(np.arange(600) / 60.0, inputs=inputs)

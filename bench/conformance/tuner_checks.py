@@ -50,6 +50,12 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
 
     An isolated process cannot start other processes and cannot access files or the network. A tuner
     that a comparison evaluates runs in such a process.
+
+    Args:
+        kind: Tuner class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
     """
     tuned = _make_tuner_spec(kind)
     if tuned is None:
@@ -60,10 +66,11 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
     location = f"{kind.__name__}: what needs files, the network or processes; docs/isolation.md"
     try:
         with start_isolated_tuner(tuned, _SEED, "run", state=state) as tuner:
-            words = np.array([_SEED], dtype=np.uint32)
-            sealed = IsolatedRun(tuner, words, float("inf"))
-            sandboxed_trace = drive_tuner(
-                sealed, task, make_evaluate(task), np.random.default_rng(_SEED)
+            # The isolated process makes the same random generator from this seed.
+            seed_words = np.array([_SEED], dtype=np.uint32)
+            isolated_run = IsolatedRun(tuner, seed_words, float("inf"))
+            isolated_trace = drive_tuner(
+                isolated_run, task, make_evaluate(task), np.random.default_rng(_SEED)
             )
     except (RunEndedError, KilledExternallyError) as error:
         last_line = str(error).strip().splitlines()[-1:]
@@ -71,17 +78,17 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
             f"expected a run in a process of its own; found {last_line}; see {location}"
         ) from None
     end_text = (
-        sandboxed_trace.reason.strip().splitlines()[-1:]
-        if sandboxed_trace.status != local_trace.status
+        isolated_trace.reason.strip().splitlines()[-1:]
+        if isolated_trace.status != local_trace.status
         else ""
     )
     check(
-        sandboxed_trace.status == local_trace.status,
+        isolated_trace.status == local_trace.status,
         f"the status {local_trace.status} when isolated",
         end_text,
         location,
     )
-    is_same = np.array_equal(sandboxed_trace.proposals, local_trace.proposals)
+    is_same = np.array_equal(isolated_trace.proposals, local_trace.proposals)
     check(is_same, "the same run when isolated", "another one", location)
     return None
 
@@ -95,6 +102,7 @@ def _make_tuner_spec(kind: type[Tuner]) -> TunerSpec | None:
         kind: Tuner class under test.
     """
     module = sys.modules.get(kind.__module__)
+    # A class that a function or a notebook cell defines is not in its module under its name.
     if getattr(module, kind.__name__, None) is not kind:
         return None
     file = inspect.getsourcefile(kind) or ""
@@ -464,7 +472,11 @@ def compute_run_digests(
         kind: class of the tuner.
         seeds: seeds of the runs.
         learned: trained state; None to train if necessary.
+
+    Returns:
+        A hash of proposals and recommendations for each seed.
     """
+    # The runs have two parameters; a stored state of this dimension prevents a training.
     if learned:
         TRAINED_TUNERS[kind, 2] = learned
     traces = [run_tuner(make_trained_tuner(kind), budget=12, seed=seed) for seed in seeds]

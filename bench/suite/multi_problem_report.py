@@ -96,6 +96,11 @@ def compare_across_problems(
 ) -> MultiProblemResult:
     """Compute joint statistics of several comparisons, and write tables, figures and a page.
 
+    Args:
+        folders: folders of the comparisons.
+        out: folder to which the files are written.
+        print_line: callback that prints one line.
+
     Raises:
         InputError: a folder is not that of a comparison, or they share no tuners.
     """
@@ -394,6 +399,7 @@ def render_multi_problem_page(
         problem_count=len(collection.mean_ranks),
         best=best,
         best_rank=float(mean_ranks.iloc[0]),
+        # The best tuner is better than these.
         better=significantly_worse,
         undecided=undecided_tuners,
         runtime_panel=runtime_panel,

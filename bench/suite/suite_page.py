@@ -48,7 +48,10 @@ MAX_PRINTED_RATIO = 1e4
 def build_headline(tables: SuiteTables) -> str:
     """Build one or two sentences that say which method to use up to which number of simulations.
 
-    Ranks do not count the cost of training; so methods without training are named too.
+    Ranks do not count the cost of training (`FREE`); so methods without training are named too.
+
+    Args:
+        tables: Statistics of the suite, with the mean ranks of its methods.
     """
     ranks = tables.ranks[tables.ranks["training"] == FREE]
     mean_ranks = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
@@ -105,6 +108,9 @@ def describe_losses(tables: SuiteTables) -> list[str]:
 
     Args:
         tables: Statistics of the suite.
+
+    Returns:
+        Lines of text.
     """
     cases = [
         (tuner, k, tables.find_losses(tuner, k, LOSS_FACTOR).to_dict("records"))
@@ -257,7 +263,12 @@ def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[
 
     A cell is a problem with one range of targets. Each entry has the rank of the method in the cell
     and a colour class from it. Methods that do not have results in every cell come last, without a
-    mean. `order` are the methods.
+    mean.
+
+    Args:
+        tables: Statistics of the suite.
+        k: Number of simulations.
+        order: All methods; their order decides between equal mean ranks.
     """
     ranks = tables.get_ranks(k)
     errors = tables.errors[tables.errors["simulations"] == k].set_index(["cell", "tuner"])
@@ -370,16 +381,20 @@ def report_suite(folder: Path, print_line: PrintLine) -> SuiteTables:
         folder: folder of the suite, with one subfolder per problem or with stored runs.
         print_line: callback that prints one line.
 
+    Returns:
+        The statistics, also those of the other methods.
+
     Raises:
         InputError: there are no results.
     """
     has_comparisons = any(list_comparison_folders(folder))
     new_runs = collect_suite_runs(folder) if has_comparisons else read_suite_runs(folder)
     suite = new_runs
-    stored = find_stored_runs(new_runs.version) if has_comparisons else None
-    if stored is not None:
-        suite = merge_runs(new_runs, stored)
+    # A folder without comparisons has stored runs already, which are reported alone.
     if has_comparisons:
+        stored = find_stored_runs(new_runs.version)
+        if stored is not None:
+            suite = merge_runs(new_runs, stored)
         write_suite_runs(new_runs, folder)
     tables = SuiteTables(suite)
     for name, frame in {**tables.build_tables(), "guide": build_guide(tables)}.items():

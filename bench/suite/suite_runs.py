@@ -297,16 +297,22 @@ def merge_runs(new_runs: SuiteRuns, stored: SuiteRuns) -> SuiteRuns:
 
     Own runs in cells of which no target is stored are left out, unless nothing is in common.
 
+    A cell is a problem with one range of targets.
+
     Args:
         new_runs: runs of one or more tuners.
         stored: runs of any tuners; those of a tuner that `new_runs` has in the same cell are left
             out.
+
+    Returns:
+        The own runs that are left, and the added ones.
     """
     # The cell and target of each run.
     own_targets, stored_targets = (
         pd.MultiIndex.from_frame(part.runs[["cell", "target"]]) for part in (new_runs, stored)
     )
     is_common = own_targets.isin(stored_targets)
+    # Without a common target the methods cannot be compared.
     if not is_common.any():
         return new_runs
     own_tuners, stored_tuners = (

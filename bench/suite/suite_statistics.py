@@ -200,6 +200,7 @@ class SuiteTables:
         share = self._get_training_share(cell, tuner) if training == COUNTED else 0.0
         errors = means[max(int(k - share), 0)]
         if share > k:
+            # A target whose start error is unknown keeps the tuner's own error without simulations.
             errors = self._start_errors[cell].reindex(errors.index).fillna(errors)
         logs = compute_log_errors(errors.to_numpy(dtype=np.float64), self._floors[cell])
         return pd.Series(logs, index=errors.index)
@@ -248,6 +249,7 @@ class SuiteTables:
         lines = []
         for (training, simulations), medians in self._medians.items():
             ranks = _rank_tuners(medians[self.complete_tuners])
+            # The same cells are drawn for every tuner and for both kinds of training cost.
             rng = make_rng("suite ranks", simulations)
             resamples = rng.integers(len(ranks), size=(_RESAMPLE_COUNT, len(ranks)))
             for tuner, mean in ranks.mean().sort_values(kind="stable").items():
