@@ -35,6 +35,9 @@ def render_track_figure(
         heights: Heights of its centre, m.
         part: Frames that are recorded.
         title: Title above the figure.
+
+    Returns:
+        The bytes of the PNG file, and those of the PDF file or None.
     """
     figure = draw_track_figure(track, heights, part, title)
     return render_png_and_pdf(figure, _TRACK_DPI)
@@ -95,6 +98,7 @@ def _draw_over_time(axis: Axes, track: BallTrack, part: slice, values: Array, la
     times, is_missing = track.times, ~np.isfinite(track.u)
     axis.axvspan(times[part][0], times[part][-1], color=RECORDED_PART_GREY, linewidth=0)
     axis.plot(times, values, ".-", color=_DETECTED_COLOUR, markersize=3, linewidth=0.7)
+    # Vertically, this transform counts in shares of the height of the panel.
     foot = np.full(is_missing.sum(), 0.02)
     transform = axis.get_xaxis_transform()
     axis.plot(
@@ -129,6 +133,7 @@ def _overlay_balls(track: BallTrack) -> RgbImage:
     # Row v and column u of each pixel.
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
     for index, frame in track.pictures.items():
+        # A frame without a detected ball has no position.
         if 0 <= index < len(track.u) and np.isfinite(track.u[index]):
             distances = np.hypot(u - track.u[index], v - track.v[index])
             is_ball = distances <= track.radius[index]

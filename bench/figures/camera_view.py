@@ -146,6 +146,7 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
         high = np.maximum(high, clipped.max(axis=0))
     width, height = np.maximum((high - low)[:2], MIN_VIEW_METRES) * (1 + 2 * MARGIN_SHARE)
     width, height = max(width, MIN_ASPECT_RATIO * height), max(height, MIN_ASPECT_RATIO * width)
+    # The middle of the box, from the axes of the camera back to those of the world.
     world_centre = (low + high) / 2 @ axes
     return Projection(azimuth, elevation, world_centre, float(width), float(height))
 

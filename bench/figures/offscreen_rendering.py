@@ -142,15 +142,19 @@ def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image
         model: compiled model.
         data: its state at the pose.
         view: camera.
+
+    Returns:
+        (H, W, 3) grey image, whose longer side has `MAX_IMAGE_PIXELS` pixels.
     """
     scale = MAX_IMAGE_PIXELS / max(view.width, view.height)  # Pixels per metre.
-    pixel_height, pixel_width = (max(2, round(scale * size)) for size in (view.height, view.width))
+    pixel_height, pixel_width = (max(2, round(scale * side)) for side in (view.height, view.width))
     global_options = model.vis.global_
     global_options.offwidth, global_options.offheight = pixel_width, pixel_height
     # In an orthographic projection, fovy is the visible height.
     global_options.orthographic, global_options.fovy = 1, view.height
-    size = float(np.hypot(view.width, view.height))
-    model.stat.extent = size
+    # Diagonal of the view in metres.
+    diagonal = float(np.hypot(view.width, view.height))
+    model.stat.extent = diagonal
     # Nearest and farthest visible distance, in extents of the model.
     model.vis.map.znear, model.vis.map.zfar = 0.01, 3 * CAMERA_DISTANCE_FACTOR
     # Shadows and reflections give no information about places.
@@ -161,7 +165,7 @@ def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
     camera.azimuth, camera.elevation = view.azimuth, view.elevation
-    camera.lookat[:], camera.distance = view.centre, CAMERA_DISTANCE_FACTOR * size
+    camera.lookat[:], camera.distance = view.centre, CAMERA_DISTANCE_FACTOR * diagonal
     with mujoco.Renderer(model, pixel_height, pixel_width) as renderer:
         renderer.update_scene(data, camera)
         colours = renderer.render().astype(np.float64)

@@ -283,14 +283,16 @@ def draw_robot_figure(
     scale = MAX_SIDE_INCHES / max(projection.width, projection.height)
     width, height = scale * projection.width, scale * projection.height
     left_width, right_width = map(_compute_column_width, (left_labels, right_labels))
-    tall = max(height, _compute_column_height(left_labels), _compute_column_height(right_labels))
+    drawing_height = max(
+        height, _compute_column_height(left_labels), _compute_column_height(right_labels)
+    )
     figure_width = left_width + width + right_width
     # 0.15 inches are the space above the scale bar.
-    figure_height = tall + SCALE_BAR_HEIGHT_INCHES + 0.15
+    figure_height = drawing_height + SCALE_BAR_HEIGHT_INCHES + 0.15
     figure, axes = make_panel_grid(1, 1, (figure_width, figure_height), layout=None)
     axis = axes[0, 0]
     # Left, bottom, width and height as shares of the figure; the picture is centred vertically.
-    bottom = SCALE_BAR_HEIGHT_INCHES + (tall - height) / 2
+    bottom = SCALE_BAR_HEIGHT_INCHES + (drawing_height - height) / 2
     axis.set_position(
         (
             left_width / figure_width,
@@ -307,9 +309,9 @@ def draw_robot_figure(
     _draw_robot(axis, robot, data, projection)
     _draw_place_rings(axis, labels)
     gap = 0.12 / scale  # 0.12 inches between the picture and its labels
-    _draw_label_column(axis, left_labels, -half_width - gap, scale, tall)
-    _draw_label_column(axis, right_labels, half_width + gap, scale, tall)
-    _draw_scale_bar(axis, projection, scale, tall)
+    _draw_label_column(axis, left_labels, -half_width - gap, scale, drawing_height)
+    _draw_label_column(axis, right_labels, half_width + gap, scale, drawing_height)
+    _draw_scale_bar(axis, projection, scale, drawing_height)
     return figure
 
 
@@ -423,7 +425,7 @@ def _divide_labels(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]
     drawing, unless both columns are: then labels near the middle move to the other side.
     """
 
-    def get_x(label: _Label) -> tuple[float, float]:
+    def get_sort_key(label: _Label) -> tuple[float, float]:
         """Return a sort key from left to right, and from top to bottom."""
         x, y = label.point.tolist()
         return x, -y
@@ -431,9 +433,10 @@ def _divide_labels(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]
     def is_too_long(column: Sequence[_Label], other: Sequence[_Label]) -> bool:
         return _compute_column_height(column) > max(MAX_SIDE_INCHES, _compute_column_height(other))
 
-    right = sorted(labels, key=get_x)
-    left = [label for label in right if label.point[0] < 0]
-    right = right[len(left) :]
+    from_left = sorted(labels, key=get_sort_key)
+    left = [label for label in from_left if label.point[0] < 0]
+    right = from_left[len(left) :]
+    # The last label on the left and the first one on the right are nearest to the middle.
     while is_too_long(left, right):
         right.insert(0, left.pop())
     while is_too_long(right, left):
@@ -485,7 +488,7 @@ def arrange_labels(
 
 
 def _draw_label_column(
-    axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: float
+    axis: Axes, labels: Sequence[_Label], x: float, scale: float, drawing_height: float
 ) -> None:
     """Write a column of labels, and a line from each to its place in the picture.
 
@@ -496,11 +499,11 @@ def _draw_label_column(
         labels: labels from top to bottom.
         x: horizontal position of the column, m.
         scale: inches per metre.
-        tall: height of the column in inches.
+        drawing_height: height of the drawing, and of the column, in inches.
     """
     # Heights in metres of the picture.
     sizes = [label.height / scale for label in labels]
-    half_height = tall / scale / 2
+    half_height = drawing_height / scale / 2
     place_heights = [float(y) for _, y in (label.point for label in labels)]
     middles = arrange_labels(place_heights, sizes, -half_height, half_height)
     for label, y in zip(labels, middles.tolist(), strict=True):
@@ -554,19 +557,21 @@ def _draw_place_rings(axis: Axes, labels: Sequence[_Label]) -> None:
         )
 
 
-def _draw_scale_bar(axis: Axes, projection: Projection, scale: float, tall: float) -> None:
+def _draw_scale_bar(
+    axis: Axes, projection: Projection, scale: float, drawing_height: float
+) -> None:
     """Draw a scale bar with a round length below the drawing.
 
     Args:
         axis: axes to draw on.
         projection: camera, with the displayed width in metres.
         scale: inches per metre.
-        tall: height of the drawing in inches.
+        drawing_height: height of the drawing in inches.
     """
     # In metres; the bar is at most 0.3 of the picture's width, and 0.2 inches below it.
     length = round_down_length(0.3 * projection.width)
     left_edge = -projection.width / 2
-    y = -tall / scale / 2 - 0.2 / scale
+    y = -drawing_height / scale / 2 - 0.2 / scale
     axis.plot(
         [left_edge, left_edge + length],
         [y, y],
@@ -598,6 +603,7 @@ def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | 
     Returns:
         The position; None if the robot has no such place.
     """
+    # The robot raises an InputError for a name that it does not have.
     try:
         if kind == "body":
             return np.array(data.xipos[robot.body(name).id])
@@ -645,6 +651,7 @@ def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
     import mujoco
 
     quantity, _, place_name = name.partition(".")
+    # The names of sensors' channels begin with "s."; all other channels are those of joints.
     if quantity != "s":
         return locate_place(robot, data, "joint", place_name)
     sensor = next((sensor for sensor in robot.sensors if sensor.name == place_name), None)

@@ -98,7 +98,10 @@ def write_archive(
         archive.parent.mkdir(parents=True, exist_ok=True)
         with atomic_replacement(archive) as partial, zipfile.ZipFile(partial, "w") as packed:
             packed.writestr(
-                _make_zip_header(f"{name}/{MANIFEST_FILE}"), manifest, zipfile.ZIP_DEFLATED, 9
+                _make_zip_header(f"{name}/{MANIFEST_FILE}"),
+                manifest,
+                compress_type=zipfile.ZIP_DEFLATED,
+                compresslevel=9,
             )
             for path, file in sorted(files.items()):
                 with (
@@ -140,6 +143,12 @@ class UnpackedArchive(NamedTuple):
 def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
     """Context that unpacks an archive into a temporary folder.
 
+    Args:
+        archive: path of the archive, which may be of unknown origin.
+
+    Yields:
+        The folder, which is deleted afterwards, the manifest, and the differences from it.
+
     Raises:
         InputError: It is not an archive of simgap, or unpacking it could be harmful.
     """
@@ -157,6 +166,7 @@ def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
                     shutil.copyfileobj(source, target, _BLOCK_BYTES)
                 name = entry.filename.removeprefix(f"{top_folder}/")
                 sizes_and_hashes[name] = path.stat().st_size, compute_sha256(path)
+            # The manifest does not list itself.
             del sizes_and_hashes[MANIFEST_FILE]
             yield UnpackedArchive(
                 Path(folder, top_folder),
@@ -444,6 +454,7 @@ def _format_compare_command(folder: Path, name: str) -> str:
         name: name of the folder in the archive.
     """
     configurations = [read_configuration(part) for part in list_study_folders(folder)]
+    # A suite gives all its comparisons the same plugins and tuners, so the first one is used.
     experiment = configurations[0].experiment
     if not experiment.suite or experiment.diagnosis:
         return f"simgap compare {name}/{CONFIGURATION_FILE}"
@@ -563,6 +574,9 @@ def _verify_archive(
         print_line: prints a line.
         plugins: plugin files to load.
         every: whether to repeat every simulation instead of a sample.
+
+    Returns:
+        The result; without results of its content if files differ from the manifest.
     """
     description = _describe_archive(archive, unpacked)
     count, size = description["files"], description["bytes"]
@@ -579,7 +593,8 @@ def _verify_archive(
     if description["kind"] == "explanation":
         explanation = _verify_explanation(unpacked.folder, archive, print_line)
         return Verification([], explanation, description)
-    # Results are named by their path in the archive, and not in the temporary folder.
+    # The plugins that the archive contains are not run. Results are named by their path in the
+    # archive, and not in the temporary folder.
     comparisons = [
         verify_comparison(part, print_line, plugins, every, own_plugins=False)._replace(
             folder=archive / part.relative_to(unpacked.folder.parent)

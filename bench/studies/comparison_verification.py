@@ -370,6 +370,7 @@ def _verify_tables(
     # The order of the rows is ignored: it depends on the version that wrote them.
     keys = ["experiment", "tuner", "range", "simulations", "metric"]
     if not set(keys) - set(stored_table):
+        # The row of a skipped tuner has empty cells, which pandas reads as NaN.
         expected = expected.sort_values(keys, kind="stable")
         stored_table = stored_table.fillna({"range": "", "metric": ""}).sort_values(
             keys, kind="stable"

@@ -71,6 +71,7 @@ class ComparisonSide:
             also for one that failed.
         """
         part = self.curves.select(range=kind, tuner=tuner)
+        # Before the end of the budget, a failed run keeps the errors of its recommendations.
         is_last = k >= part.values.shape[1] - 1
         errors = part.values[:, k]
         is_failed = np.isnan(errors) | (part.failed & is_last)

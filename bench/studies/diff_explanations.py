@@ -214,9 +214,11 @@ class ExplanationDiff:
             _collect_coefficients(self.a), _collect_coefficients(self.b)
         )
         parameters = _pair_coefficients(self.a.verdict.parameters, self.b.verdict.parameters)
+        # The rows of both lists, which are extended in place.
         rows = [*coefficients, *parameters]
         corrected = correct_holm(np.array([_compute_p_value(row) for row in rows]))
         for row, value in zip(rows, corrected, strict=True):
+            # Without a p-value, because a number is missing or uncertain, it is not known.
             row["significant"] = bool(value < FAMILYWISE_ERROR_RATE) if np.isfinite(value) else None
         return coefficients, parameters
 
@@ -225,6 +227,7 @@ class ExplanationDiff:
         """True if verdict or causes differ, or a number differs significantly."""
         has_other_verdict = self.a.verdict.verdict != self.b.verdict.verdict
         has_other_numbers = any(row["significant"] for rows in self.numbers for row in rows)
+        # An effect is a cause in one explanation, and not in the other one.
         has_other_causes = any(
             "cause" in pair and len(set(pair)) > 1 for pair in self._list_cause_places()
         )
