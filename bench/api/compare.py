@@ -205,6 +205,8 @@ def _warn_of_missing_problem(name: str, reason: str) -> None:
         name: name of the problem.
         reason: why it is left out.
     """
+    # The warning names the line of the user's script: its frame is the fifth one, outside of this
+    # function, `begin_studies`, `sweep` and the decorator of `sweep`.
     warnings.warn(f"{name} is left out: {reason}", stacklevel=5)
 
 

@@ -91,6 +91,7 @@ def list_sources(
             number = f" {len(sources) + 1}" if len(given_sources) > 1 else ""
             sources.append(read_frame_recording(source, frame_description, f"DataFrame{number}"))
         else:
+            # Files have their own descriptions, so one that is given needs a data frame.
             if not frames:
                 frame_description.refuse_for_files(source)
             sources.append(source.recording if isinstance(source, SimulatedRecording) else source)

@@ -64,6 +64,7 @@ def select_training(
         simulator = load_experiment(experiment).simulator
     # A robot's simulator is not registered; it is defined by its experiment.
     has_model = experiment is not None and load_experiment(experiment).model
+    # A simulator of a plugin is only known when the plugin is loaded, below.
     if not plugins and not has_model:
         simulators.get(simulator)  # raises an error for an unknown name
     chosen_experiment = load_experiment(experiment or default_experiment(simulator)).chosen(
@@ -75,7 +76,7 @@ def select_training(
     )
     chosen_experiment = complete_robot_experiment(chosen_experiment)
     if not chosen_experiment.model:
-        simulators.get(simulator)
+        simulators.get(simulator)  # a plugin may not define it either
     if chosen_experiment.simulator != simulator:
         raise InputError(
             f"experiment {chosen_experiment.name}: its simulator is {chosen_experiment.simulator}, "
@@ -87,7 +88,7 @@ def select_training(
     if not tuners.get(entry.tuner).learned:
         raise InputError(f"tuner {entry.label} does not learn: there is nothing to train")
     if not chosen_experiment.trusted:
-        must_build_isolated(entry)
+        must_build_isolated(entry)  # raises an error for wrong options, before the training
     return chosen_experiment, entry
 
 

@@ -228,7 +228,8 @@ def _draw_series(
         else:
             axis.errorbar(x, y, yerr=ends, elinewidth=0.8, capsize=1.5, **look)
         return
-    # Markers only where tables have numbers; the line goes through all points.
+    # Markers only where tables have numbers; the line goes through all points. Matplotlib takes the
+    # indices of the marked points, or a number n for every n-th point.
     ticks = panel.across.ticks
     marked = (
         np.flatnonzero(np.isin(x, ticks)).tolist() if ticks else max(1, len(x) // _MARKED_POINTS)

@@ -77,6 +77,7 @@ def draw_intervals(
             to_pixels(value),
             to_pixels(begin),
             to_pixels(end),
+            # The middle of row i; the drawing has a margin of one pixel at the top and bottom.
             distance // 2 + 1 + distance * i,
         )
         for i, (kind, value, begin, end) in enumerate(intervals)
@@ -86,4 +87,5 @@ def draw_intervals(
         left, right = map(to_pixels, band)
         # A narrow band is drawn 1.5 pixels wide, so that it remains visible.
         band_extent = left, max(right - left, 1.5)
-    return IntervalDrawing(rows, distance * len(rows) + 2, distance / 4 + 0.5, band_extent)
+    height, mark_radius = distance * len(rows) + 2, distance / 4 + 0.5
+    return IntervalDrawing(rows, height, mark_radius, band_extent)

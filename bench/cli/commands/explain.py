@@ -132,6 +132,7 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     # What the verdict contains but the extended simulator, or a range, cannot express.
     for line in (*explanation.unsaid, *left_out):
         print_line(line)
+    # The report page is the last file that is written.
     *result_files, report = paths
     print_line(f"\n{_FILE_LABELS['report.html']:11} {report}")
     for path in result_files:
