@@ -56,6 +56,9 @@ def select_training(
         plugins: Plugin files that they need.
         trust: Train the tuner inside the harness, for comparisons that do likewise.
 
+    Returns:
+        The experiment, and the entry of the tuner in it.
+
     Raises:
         InputError: The arguments do not fit together, or the tuner does not learn.
     """

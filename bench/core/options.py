@@ -70,6 +70,7 @@ def takes_options(
     """
 
     def decorate(function: Callable[[Options], Result]) -> Callable[P, Result]:
+        """Return the function that makes the options from its arguments, and calls `function`."""
         signature, function_name = inspect.signature(options), name or function.__name__
 
         @wraps(function)
@@ -99,6 +100,7 @@ def with_options(
     def decorate(
         function: Callable[[Source, Options], Result],
     ) -> Callable[Concatenate[Source, P], Result]:
+        """Return the function that makes the options from keywords, and calls `function`."""
         # The caller gives the fields of the second argument, the options, by keyword.
         source, _ = inspect.signature(function).parameters.values()
         keywords = inspect.signature(options).parameters.values()

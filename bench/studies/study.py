@@ -41,6 +41,9 @@ def begin_studies(
         salt: salt of the targets, secret until the study is complete; None for a new one. Several
             studies of one sweep share it, so that they have the same targets.
 
+    Returns:
+        The studies in their new folders, without any run.
+
     Raises:
         InputError: one of the studies has an error, or the folder is not free; no files are left
             behind.

@@ -56,7 +56,7 @@ class SuiteTables:
 
     @cached_property
     def curves(self) -> dict[str, dict[str, RunCurves]]:
-        """Error curves of the runs of each tuner, by cell and tuner."""
+        """Error curves of the runs of each tuner, by cell (problem and range) and tuner."""
         curves: dict[str, dict[str, RunCurves]] = {str(c): {} for c in self.suite.cells["cell"]}
         for (cell, tuner), keys in self.suite.runs.groupby(["cell", "tuner"], sort=False):
             curves[str(cell)][str(tuner)] = RunCurves(
@@ -79,7 +79,7 @@ class SuiteTables:
 
     @cached_property
     def _floors(self) -> dict[str, float]:
-        """Error of each cell below which tuners count as equal.
+        """Error of each cell (problem with one range of targets) below which tuners count as equal.
 
         For simulated targets it is the `negligible_error` of the experiment. For a recording, whose
         error cannot become zero, it is the smallest median error increased by that share.
@@ -100,7 +100,8 @@ class SuiteTables:
     def _target_means(self) -> dict[str, dict[str, pd.DataFrame]]:
         """Mean errors over seeds, by cell and tuner.
 
-        Each table has a row per target and a column per number of simulations.
+        A cell is a problem with one range of targets. Each table has a row per target and a column
+        per number of simulations.
         """
         return {
             cell: {
@@ -114,15 +115,15 @@ class SuiteTables:
     def _start_errors(self) -> dict[str, pd.Series[float]]:
         """Errors of the starts by target, for each cell: those of tuners without training.
 
-        The start is the point at which a tuner begins, before any simulation of its own; trained
-        tuners may begin elsewhere.
+        A cell is a problem with one range of targets. The start is the point at which a tuner
+        begins, before any simulation of its own; trained tuners may begin elsewhere.
         """
         start_errors = {}
         for cell, by_tuner in self.curves.items():
             errors = [
                 pd.Series(curves.values[:, 0], index=curves.keys["target"])
                 for tuner, curves in by_tuner.items()
-                if not self._get_training_share(cell, tuner)
+                if not self._get_training_share(cell, tuner)  # it is 0 without training
             ]
             # Empty if all tuners of the cell are trained.
             errors = errors or [pd.Series(dtype=float)]
@@ -160,11 +161,12 @@ class SuiteTables:
     def _compute_medians(self, k: int, training: str) -> pd.DataFrame:
         """Compute median log errors over targets: a row per cell, a column per tuner.
 
-        A tuner that lacks a run on some target of a cell has no median (NaN) there.
+        A cell is a problem with one range of targets. A tuner that lacks a run on some target of a
+        cell has no median (NaN) there.
 
         Args:
             k: number of simulations.
-            training: `FREE` or `COUNTED`.
+            training: `FREE` if the cost of training is not counted, `COUNTED` if it is.
         """
         medians = {}
         for cell, by_tuner in self._target_means.items():
@@ -192,10 +194,10 @@ class SuiteTables:
 
         Args:
             means: mean errors over seeds, a row per target, a column per number of simulations.
-            cell: name of the cell.
+            cell: name of the cell, a problem with one range of targets.
             tuner: label of the tuner.
             k: number of simulations.
-            training: `FREE` or `COUNTED`.
+            training: `FREE` if the cost of training is not counted, `COUNTED` if it is.
         """
         share = self._get_training_share(cell, tuner) if training == COUNTED else 0.0
         errors = means[max(int(k - share), 0)]
@@ -220,7 +222,11 @@ class SuiteTables:
 
     @cached_property
     def errors(self) -> pd.DataFrame:
-        """Median errors and ranks by cell, tuner and number of simulations."""
+        """Median errors and ranks by cell, tuner and number of simulations.
+
+        A cell is a problem with one range of targets. The errors are those of all runs; `failures`
+        is the number of runs that failed, which have infinite errors.
+        """
         lines = []
         for simulations in self.checkpoints:
             ranks = self.get_ranks(simulations)
@@ -243,8 +249,9 @@ class SuiteTables:
     def ranks(self) -> pd.DataFrame:
         """Mean ranks over cells with 95 % bootstrap intervals, best first.
 
-        The intervals come from resampled cells: they say how far the mean rank depends on the
-        chosen problems. Only tuners with results in every cell are ranked.
+        A cell is a problem with one range of targets. The intervals come from resampled cells: they
+        say how far the mean rank depends on the chosen problems. Only tuners with results in every
+        cell are ranked. The column `training` says whether the cost of training is counted.
         """
         lines = []
         for (training, simulations), medians in self._medians.items():
@@ -263,14 +270,15 @@ class SuiteTables:
     def pairs(self) -> pd.DataFrame:
         """Test the best tuner against each other one over all cells.
 
-        The test is Wilcoxon's signed-rank test of the median log errors, with Holm's correction for
-        the number of tuners. One row per tuner, number of simulations, and with or without training
-        cost.
+        A cell is a problem with one range of targets. The test is Wilcoxon's signed-rank test of
+        the median log errors, with Holm's correction for the number of tuners. One row per tuner,
+        number of simulations, and with or without training cost.
         """
         lines = []
         # The key is `FREE` or `COUNTED` training, and the number of simulations.
         for key, all_medians in self._medians.items():
             medians = all_medians[self.complete_tuners]
+            # A single tuner makes no pair.
             if medians.shape[1] < 2:
                 continue
             best = str(_rank_tuners(medians).mean().idxmin())
@@ -291,8 +299,9 @@ class SuiteTables:
     def running_times(self) -> pd.DataFrame:
         """Compute expected running times to three error levels, also with the training's cost.
 
-        The levels of a problem from recorded data are multiples of its smallest error, since its
-        true parameters are unknown. The training's cost is the part of it that falls on one target.
+        There is one row per cell (problem with one range of targets), tuner and level. The levels
+        of a problem from recorded data are multiples of its smallest error, since its true
+        parameters are unknown. The training's cost is the part of it that falls on one target.
         """
         lines = []
         for row in self.suite.cells.itertuples():
@@ -321,7 +330,7 @@ class SuiteTables:
         """Mean ranks by problem property: dimension, noise, range, misspecification and others.
 
         A row has the property and its value, the number of simulations, the tuner, its mean rank,
-        and the number of cells.
+        and the number of cells (problems with one range of targets) over which the mean is taken.
         """
         lines = []
         for simulations in self.checkpoints:

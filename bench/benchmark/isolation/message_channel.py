@@ -116,6 +116,10 @@ class MessageChannel:
         """Store the descriptors, and prepare polling.
 
         Polling is needed so that every read and write can have a deadline.
+
+        Args:
+            reading: file descriptor of the pipe from the other side.
+            writing: file descriptor of the pipe to the other side.
         """
         self._reading, self._writing = reading, writing
         self._buffer = bytearray(_MAX_READ_BYTES)

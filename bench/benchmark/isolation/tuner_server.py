@@ -52,8 +52,13 @@ from methods.tuner import (
 def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers: list[str]) -> None:
     """Serve requests until the harness closes the channel; the harness is the process that scores.
 
-    First the active isolation layers are reported. An error in the tuner's code is reported and
-    ends its run, but not this process.
+    First the active isolation layers are reported, by message ``R`` ("ready"). An error in the
+    tuner's code is reported and ends its run, but not this process.
+
+    Args:
+        channel: channel to the harness.
+        policy: folder and files that this process may access.
+        active_layers: names of the active isolation layers.
     """
     channel.send_document(b"R", active_layers)
     # NumPy was preloaded, so code that uses its global generator would get the same numbers in each
@@ -64,6 +69,7 @@ def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers:
         reported_paths: set[str] = set()
         while True:
             message = channel.receive(MAX_HARNESS_MESSAGE_BYTES)
+            # The harness asks for the files that the tuner has written.
             if message.kind == b"N":
                 _report_written_files(channel, policy.folder, reported_paths)
                 continue

@@ -66,8 +66,14 @@ def _make_observed_runs(
 ) -> ObservedRuns:
     """Convert the fitted or the held-out runs of a recording to scenarios and observations.
 
-    The observations of all runs are concatenated to (T, C): T samples of all runs together, C
-    channels in the order of the simulator.
+    Args:
+        recording: the recording, with its constants.
+        runs: the runs to convert.
+        simulator: simulator whose channels are read.
+
+    Returns:
+        One scenario for each run, and the observations (T, C): T samples of all runs together, C
+        channels in the order of the simulator.
     """
     names = [channel.name for channel in simulator.channels]
     observed = [np.stack([run.channels[name] for name in names], axis=1) for run in runs]

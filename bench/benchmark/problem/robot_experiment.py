@@ -96,6 +96,10 @@ def find_model(path: str, name: str) -> Path:
     It can be in an installed package (``package://NAME/FILE``), below $SIMGAP_ROBOTS, in the user's
     folder of data sets, or a path.
 
+    Args:
+        path: path of the file as the experiment states it.
+        name: name of the experiment, for messages.
+
     Raises:
         PartUnavailableError: the file is in none of these places.
     """

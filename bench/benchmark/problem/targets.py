@@ -134,6 +134,12 @@ def draw_target(problem: TargetProblem, kind: str, index: int) -> Target:
 def count_redraws(experiment: Experiment, drawn_targets: Sequence[Target]) -> Redraws:
     """Count the draws of all targets.
 
+    A target is drawn again if its own simulation diverges.
+
+    Args:
+        experiment: configuration of the experiment, for messages.
+        drawn_targets: all targets, each with the number of its discarded draws.
+
     Raises:
         InputError: more than `MAX_FAILED_SHARE` of the draws diverged.
     """

@@ -214,7 +214,13 @@ def prepare_experiment(experiment: Experiment, salt: str | None = None) -> Exper
 def _iterate_planned_runs(
     experiment: Experiment, entries: list[TunerEntry], targets: list[Target]
 ) -> Iterator[PlannedRun]:
-    """Iterate over all runs, target by target, so that the remaining time can be estimated."""
+    """Iterate over all runs, target by target, so that the remaining time can be estimated.
+
+    Args:
+        experiment: configuration of the experiment, with numbers of seeds and simulations.
+        entries: entries of the tuners that can be used here.
+        targets: targets with their true parameters.
+    """
     make_run_id = RunIds(experiment).make_run_id
     for target in targets:
         for entry in entries:

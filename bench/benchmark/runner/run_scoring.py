@@ -34,7 +34,13 @@ def make_unfinished_outcome(
 
 
 def make_status(problem: TuningProblem, request: RunRequest, outcome: RunOutcome) -> RunStatus:
-    """Make the status row of a run."""
+    """Make the status row of a run.
+
+    Args:
+        problem: tuning problem.
+        request: tuner, target and seed of the run.
+        outcome: how the run ended.
+    """
     trace = outcome.trace
     return RunStatus(
         run=request.run,

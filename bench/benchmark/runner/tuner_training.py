@@ -259,6 +259,11 @@ def compute_training_key(experiment: Experiment, entry: TunerEntry, seed: int) -
 
     It is the name of the file of the weights, so that weights are reused only by an equal training.
 
+    Args:
+        experiment: configuration with the simulator, the training range and the training budget.
+        entry: tuner with its options.
+        seed: seed of the training.
+
     Raises:
         InputError: the source of the tuner or the simulator cannot be found.
     """
@@ -416,6 +421,10 @@ def _check_weights(request: TrainingRequest, path: Path) -> None:
     """Restore the tuner from stored weights, to raise an error if it does not accept them.
 
     The code of a tuner that is not trusted runs in an isolated process.
+
+    Args:
+        request: tuner, and how to build it in isolation.
+        path: file of the weights.
 
     Raises:
         WeightsError: the tuner does not accept the weights.

@@ -153,6 +153,9 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
         curves: errors of all runs.
         budget: largest number of simulations.
         floor: error at or below which errors count as equal.
+
+    Returns:
+        Rankings by number of simulations.
     """
     has_failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
     rankings: dict[int, _Ranking] = {}
@@ -183,6 +186,9 @@ def _build_verdict_rows(
         ranking: tuners in the order of their median errors.
         curves: errors of each run over the number of simulations.
         key: first columns of each row: experiment, range and number of simulations.
+
+    Returns:
+        One row per tuner, in the order of the ranking, columns `RANKING_COLUMNS`.
     """
     logs, ranks, order = ranking
     runs = {t: curves.select(tuner=t).failed for t in order}

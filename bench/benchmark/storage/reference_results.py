@@ -208,6 +208,10 @@ def _find_reference_folder(name: str) -> Path:
 def _read_reference(name: str, folder: Path) -> ReferenceResult:
     """Read the table, configuration and environment of a reference comparison from its folder.
 
+    Args:
+        name: name by which the reference was requested.
+        folder: its folder.
+
     Raises:
         InputError: one of the three files is missing or damaged.
     """

@@ -54,9 +54,14 @@ def draw_salt_if_needed(experiment: Experiment, salt: str | None) -> tuple[Exper
 def read_salt(folder: Path, experiment: Experiment) -> str | None:
     """Read the secret salt of a study to be resumed; None if it is public or revealed.
 
+    Args:
+        folder: Folder of the study.
+        experiment: Its configuration, with the hash of the salt.
+
     Raises:
         InputError: It is missing, or differs from the committed one.
     """
+    # A revealed or public salt is in the configuration; only a secret one has a hash.
     if experiment.salt or not experiment.salt_sha256:
         return None
     path = folder / SEGMENTS_FOLDER / SALT_FILE

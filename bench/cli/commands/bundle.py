@@ -38,6 +38,10 @@ def add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_bundle(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap bundle`: pack a result folder into one archive.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code (0).
     """

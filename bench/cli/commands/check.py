@@ -27,6 +27,10 @@ def add_check_arguments(check: argparse.ArgumentParser) -> None:
 def _run_check(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap check`: run the conformance checks of a part, such as a tuner of a plugin.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a check failed.
     """

@@ -59,6 +59,10 @@ def _begin_or_resume(options: argparse.Namespace, print_line: PrintLine) -> list
 
     Problems of a suite that cannot run here are printed with what they need.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Raises:
         InputError: Options are given that would change a study to be resumed.
     """
@@ -93,6 +97,10 @@ def _run_compare(options: argparse.Namespace, print_line: PrintLine) -> CommandR
 
     The comparisons of a sweep also get a joint report. After an interrupt the remaining ones are
     not begun.
+
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
 
     Returns:
         The JSON document of the command, and the largest exit code of its comparisons.

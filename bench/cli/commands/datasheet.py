@@ -38,7 +38,12 @@ def add_datasheet_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_datasheet(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Make a data sheet; explain the logs first unless an explanation is given."""
+    """Execute `simgap datasheet`: make a data sheet; first explain the logs unless that is done.
+
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+    """
     from bench.api.datasheet import DatasheetOptions, check_joint_exists, datasheet
     from bench.api.explain import explain
     from bench.cli.progress_display import ProgressDisplay

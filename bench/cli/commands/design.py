@@ -36,6 +36,10 @@ def _run_design(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
     The proposal is written to a file of commands (`options.out`), which must not exist yet. The
     search shows its progress on stderr, and Ctrl-C ends it with what it has.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if there is no
         proposal.

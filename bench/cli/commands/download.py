@@ -48,6 +48,10 @@ def _run_download(options: argparse.Namespace, print_line: PrintLine) -> Command
 
     Without a name it lists all data sets and downloads nothing.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code (0).
     """

@@ -86,6 +86,10 @@ def _run_explain(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     """Execute `simgap explain`: explain recordings, write the results, print the text summary.
 
     The search shows its progress on stderr, and Ctrl-C ends it with the best result so far.
+
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
     """
     from bench.api.explain import explain
     from bench.benchmark.storage.provenance import get_utc_time, write_explanation_environment
@@ -158,6 +162,10 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
 
     Worker processes share the recordings. Results that an earlier call has left in the output
     folder are kept, so that an interrupted call can be continued.
+
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
     """
     from bench.benchmark.runner.plugin_discovery import Plugin
     from bench.benchmark.runner.worker_pools import make_pool

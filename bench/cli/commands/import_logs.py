@@ -38,6 +38,10 @@ def _run_import(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
     Everything that was guessed is printed, because the user should confirm it. The log files
     themselves are not copied.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code (0).
     """

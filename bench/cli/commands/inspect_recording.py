@@ -71,6 +71,10 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     ``--fix`` it writes a corrected description, with ``--check`` it says which parameters the data
     determine.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if the data do not
         determine a parameter that should be fitted.
@@ -217,6 +221,10 @@ def _print_identifiability(
 
     The numbers are those that the user named with ``--free``, then the coefficients of the possible
     causes. The same is returned as JSON documents.
+
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
     """
     from bench.diagnosis.identifiability import check_identifiability, format_identifiability
 

@@ -48,6 +48,10 @@ def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     Several comparisons together give one joint result, which needs the folder `options.out`.
     Results named with ``--behind`` are drawn in grey behind them.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code (0).
     """

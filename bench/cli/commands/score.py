@@ -31,7 +31,15 @@ def add_score_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_score(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
-    """Print a model's error on a recording."""
+    """Execute `simgap score`: print the error of an extended simulator on a recording.
+
+    Errors are root mean squares of each channel in its unit, and over all channels in units of the
+    noise.
+
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+    """
     from bench.api.explain import score
     from bench.core.plugin_registries import load_plugins
 

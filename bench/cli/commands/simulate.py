@@ -209,6 +209,10 @@ def _run_simulate(options: argparse.Namespace, print_line: PrintLine) -> Command
 
     The true parameters are in a separate file, so that the recording can be explained without them.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code (0).
     """

@@ -34,6 +34,10 @@ def add_status_arguments(status: argparse.ArgumentParser) -> None:
 def _run_status(options: argparse.Namespace, print_line: PrintLine) -> CommandResult:
     """Execute `simgap status`: print how far a study is, or without one the isolation layers.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a study is not
         complete.

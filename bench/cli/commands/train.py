@@ -72,6 +72,10 @@ def _run_train(options: argparse.Namespace, print_line: PrintLine) -> CommandRes
     The weights are stored in the cache, where `simgap compare` finds them. The losses of each epoch
     are drawn, unless all weights were in the cache already.
 
+    Args:
+        options: parsed arguments of the command.
+        print_line: prints one line of text.
+
     Returns:
         The JSON document of the command, and its exit code (0).
     """
