@@ -250,7 +250,8 @@ def _make_median_chart(
         view: comparison with its statistics, experiment and styles of tuners.
         table: name of the table of the panels.
         metrics_and_ranges: metric and range of targets of each panel.
-        side_by_side: facet whose panels are side by side.
+        side_by_side: facet whose panels are side by side. A facet is a property by which a reader
+            of the page chooses panels.
     """
     statistics, budget = view.statistics, view.experiment.budget
     x_axis = make_simulations_axis(budget)
@@ -305,6 +306,7 @@ def make_distance_chart(view: ComparisonView) -> ComparisonChart:
         series = _make_tuner_series(
             view, table, "median", "points", "low", "high", simulations=str(simulations)
         )
+        # A facet is a property by which a reader of the page chooses panels.
         facets = {"after": f"{simulations} simulations"}
         title = f"After {simulations} simulations"
         panels.append(Panel(title, "distance", "bin", series, x_axis, Axis(label, "log"), facets))

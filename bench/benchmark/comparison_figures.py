@@ -300,6 +300,7 @@ def draw_figure(
         raise make_unknown_name_error("figure", name, figure_names)
     if references:
         check_references_allowed(stored, name, references)
+    # The figure of identifiability is the only one that is not a chart of the page.
     if name == "spectra":
         assert stored.spectra is not None
         figure = draw_spectra_figure(stored.experiment, stored.spectra)

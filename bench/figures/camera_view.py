@@ -260,6 +260,7 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
     import mujoco
 
     floor_types = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+    # The eight corners of a cube with half-lengths of 1.
     corners = np.array(list(product((-1, 1), repeat=3)))
     # Points (n, 3) in the world, with the body they belong to.
     points_with_body: list[tuple[int, Array]] = []
@@ -274,10 +275,11 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
     for body in range(1, model.nbody):
         if body not in shaped_bodies:
             points_with_body.append((body, data.xipos[body][None]))
-    moving, static = [data.xipos[:0]], [data.xipos[:0]]
-    for body, points in points_with_body:
-        (static if _is_static_body(model, body) else moving).append(points)
-    return np.concatenate(moving), np.concatenate(static)
+    # Without any points, the result must still have the shape (0, 3).
+    no_points = np.empty((0, 3))
+    moving = [points for body, points in points_with_body if not _is_static_body(model, body)]
+    static = [points for body, points in points_with_body if _is_static_body(model, body)]
+    return np.concatenate([no_points, *moving]), np.concatenate([no_points, *static])
 
 
 def _is_static_body(model: Any, body: int) -> bool:

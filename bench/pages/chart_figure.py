@@ -159,6 +159,7 @@ def _draw_panel(axis: Axes, panel: Panel, table: pd.DataFrame | Table, horizonta
     style_axis(axis)
     for span in panel.spans:
         _draw_span(axis, span)
+    # A strip at the bottom needs space below the series.
     if any(span.foot for span in panel.spans):
         axis.margins(y=_FOOT_MARGIN)
     for series in panel.series:

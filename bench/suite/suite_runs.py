@@ -136,6 +136,7 @@ def collect_suite_runs(folder: Path) -> SuiteRuns:
     Raises:
         InputError: no comparison is finished, or a folder is damaged.
     """
+    # A comparison is finished when its segments, the plan and the journal of runs, are deleted.
     collected_runs = [
         _collect_comparison(part, condition)
         for part, condition in list_comparison_folders(folder)

@@ -401,12 +401,14 @@ class SuiteTables:
     def ranks_over_common_targets(self) -> pd.DataFrame:
         """Mean ranks over the targets that every tuner of their cell ran; empty if these are all.
 
-        They compare slow tuners, which ran on some of the targets only, with the others.
+        A cell is a problem with one range of targets. These ranks compare slow tuners, which ran on
+        some of the targets only, with the others.
         """
         runs = self.suite.runs
         tuner_counts = runs.groupby("cell")["tuner"].nunique()
         by_target = runs.groupby(["cell", "target"])["tuner"].transform("nunique")
         is_common = by_target == runs["cell"].map(tuner_counts)
+        # No rows, but the columns of a table of ranks.
         if is_common.all():
             return self.ranks.iloc[:0]
         return SuiteTables(self.suite.select(is_common)).ranks

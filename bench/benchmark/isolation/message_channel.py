@@ -44,10 +44,32 @@ MAX_HARNESS_MESSAGE_BYTES = 1 << 40
 """Maximum size of a message from the harness in bytes; practically unlimited, as it is trusted."""
 
 
+class MessageKind:
+    """Kinds of messages, one byte each; the comments say who sends them, and their content."""
+
+    READY = b"R"  # process: it has started; the active isolation layers
+    BUILD = b"B"  # harness: build a tuner; its specification
+    DONE = b"K"  # both: the request was executed; its result, if it has one
+    WEIGHTS = b"L"  # both: trained arrays, to be loaded by the tuner or to be stored
+    TASK = b"T"  # harness: run the tuner on a task; the task
+    PROPOSALS = b"A"  # process: points to simulate, and the point that is recommended
+    EVALUATION = b"E"  # harness: points, losses and observations
+    STOPPED = b"S"  # process: the tuner has stopped by itself; its reason
+    CLOSE = b"C"  # harness: the run is over; the tuner must close its resources
+    FIT = b"F"  # harness: train the tuner; the budget and the seed
+    TRAINING_REQUEST = b"P"  # process: properties of a simulator, or points to simulate
+    PROPERTIES = b"O"  # harness: properties of the simulator, and observations if requested
+    REFUSAL = b"X"  # harness: the request is not valid, or beyond the budget; the reason
+    PROGRESS = b"W"  # process: losses of one epoch of the training
+    FAILURE = b"D"  # process: code of the tuner has failed; the traceback
+    WRITTEN_FILES = b"N"  # both: question for the files that the tuner wrote, and the answer
+    QUESTION = b"Q"  # harness: which plugin to describe
+
+
 EVALUATION_SIMULATOR_FLAG = 1
-"""Flag of a message P of a training: it concerns the simulator for evaluation, not for training."""
+"""Flag of a training request: it concerns the simulator for evaluation, not for training."""
 SIMULATE_FLAG = 2
-"""Flag of a message P of a training: points are to be simulated."""
+"""Flag of a training request: points are to be simulated."""
 
 
 class PeerClosedError(Exception):
@@ -62,7 +84,7 @@ class Message(NamedTuple):
     """Message received through the pipe.
 
     Attributes:
-        kind: one byte; see `isolation.tuner_server` and `isolation.tuner_processes`.
+        kind: one byte, see `MessageKind`.
         flags: number whose meaning depends on the kind.
         size: number whose meaning depends on the kind.
         body: content; valid until the next message is read.

@@ -22,6 +22,7 @@ from bench.benchmark.isolation.message_channel import (
     MAX_TEXT_BYTES,
     Message,
     MessageChannel,
+    MessageKind,
     PeerClosedError,
     ProtocolError,
     pack_arrays,
@@ -186,8 +187,7 @@ class IsolatedProcess:
             raise self.fail_with_protocol_error(str(error)) from None
         except PeerClosedError:
             raise self._make_exit_error() from None
-        # The process reports a failure of the tuner by this message; its text is the traceback.
-        if message.kind == b"D":
+        if message.kind == MessageKind.FAILURE:
             raise RunEndedError("crashed", with_isolation(message.to_text()))
         return message
 
@@ -200,8 +200,7 @@ class IsolatedProcess:
             return NOTHING_WRITTEN
         deadline = perf_counter() + _REPORT_TIMEOUT_SECONDS
         try:
-            # Message ``N`` asks for the number and the first names of the written files.
-            self.send(b"N", deadline=deadline)
+            self.send(MessageKind.WRITTEN_FILES, deadline=deadline)
             report = self.receive(deadline=deadline).to_document()
             # Code of the tuner may have made the report, so its size is limited.
             count = max(0, min(int(report["count"]), _MAX_REPORTED_FILES))
@@ -314,8 +313,7 @@ class IsolatedTuner:
     ) -> None:
         """Send the specification of the tuner to its process, then the weights if there are any.
 
-        The tuner has been built when the process has answered. Message kinds: B builds, L loads
-        weights.
+        The tuner has been built when the process has answered.
 
         Args:
             child: process of the tuner.
@@ -326,11 +324,11 @@ class IsolatedTuner:
         child.wait_until_ready()
         started = perf_counter()
         deadline = started + START_TIMEOUT_SECONDS
-        child.send(b"B", json.dumps(tuned.describe()).encode(), deadline=deadline)
+        child.send(MessageKind.BUILD, json.dumps(tuned.describe()).encode(), deadline=deadline)
         child.receive(deadline=deadline)
         self.import_seconds = perf_counter() - started
         if state is not None:
-            child.send(b"L", *pack_arrays(state), deadline=deadline)
+            child.send(MessageKind.WEIGHTS, *pack_arrays(state), deadline=deadline)
             child.receive(deadline=deadline)
 
 
@@ -384,7 +382,7 @@ class IsolatedRun:
                 "stream": self.stream.astype(np.int64),
             }
         )
-        child.send(b"T", *packed_arrays, deadline=deadline)
+        child.send(MessageKind.TASK, *packed_arrays, deadline=deadline)
         try:
             while True:
                 answer = self._receive_answer(task, deadline)
@@ -396,7 +394,7 @@ class IsolatedRun:
                     self._close_tuner()
                     raise
                 child.send(
-                    b"E",
+                    MessageKind.EVALUATION,
                     evaluation.proposals.tobytes(),
                     evaluation.losses.tobytes(),
                     evaluation.observations.tobytes(),
@@ -409,9 +407,9 @@ class IsolatedRun:
             affinity_controller.release_affinity()
 
     def _receive_answer(self, task: Task, deadline: float) -> Array | Proposal | str:
-        """Receive the tuner's answer: points to simulate (A), or the reason of its end (S).
+        """Receive the tuner's answer: points to simulate, or the reason of its end.
 
-        The body of a message ``A`` is [recommended point (dim,), if flags is 1] and then n points
+        The body of proposals is [recommended point (dim,), if flags is 1] and then n points
         (n, dim), with n in the field `size`. Any other message ends the process, because code of a
         tuner may send any bytes.
 
@@ -431,7 +429,7 @@ class IsolatedRun:
         # 8 bytes per float64, for all points of the budget and a recommendation.
         limit = min(MAX_PROPOSAL_BYTES, 8 * task.dim * (task.budget + 2))
         message = child.receive(max(limit, MAX_TEXT_BYTES), deadline)
-        if message.kind == b"S":
+        if message.kind == MessageKind.STOPPED:
             return message.to_text()
         dim, point_count = task.dim, message.size
         try:
@@ -440,7 +438,7 @@ class IsolatedRun:
             raise child.fail_with_protocol_error(str(error)) from None
         recommends = message.flags == 1
         if (
-            message.kind != b"A"
+            message.kind != MessageKind.PROPOSALS
             or not point_count
             or coordinates.size != (point_count + recommends) * dim
         ):
@@ -457,5 +455,5 @@ class IsolatedRun:
         """
         child = self.tuner.child
         deadline = perf_counter() + min(self.seconds, _CLOSE_TIMEOUT_SECONDS)
-        child.send(b"C", deadline=deadline)
+        child.send(MessageKind.CLOSE, deadline=deadline)
         child.receive(deadline=deadline)

@@ -29,6 +29,7 @@ from bench.benchmark.isolation.message_channel import (
     SIMULATE_FLAG,
     Message,
     MessageChannel,
+    MessageKind,
     PeerClosedError,
     decode_rng_state,
     encode_rng_state,
@@ -52,15 +53,15 @@ from methods.tuner import (
 def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers: list[str]) -> None:
     """Serve requests until the harness closes the channel; the harness is the process that scores.
 
-    First the active isolation layers are reported, by message ``R`` ("ready"). An error in the
-    tuner's code is reported and ends its run, but not this process.
+    First the active isolation layers are reported. An error in the tuner's code is reported and
+    ends its run, but not this process.
 
     Args:
         channel: channel to the harness.
         policy: folder and files that this process may access.
         active_layers: names of the active isolation layers.
     """
-    channel.send_document(b"R", active_layers)
+    channel.send_document(MessageKind.READY, active_layers)
     # NumPy was preloaded, so code that uses its global generator would get the same numbers in each
     # run.
     np.random.seed()  # noqa: NPY002
@@ -69,8 +70,7 @@ def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers:
         reported_paths: set[str] = set()
         while True:
             message = channel.receive(MAX_HARNESS_MESSAGE_BYTES)
-            # The harness asks for the files that the tuner has written.
-            if message.kind == b"N":
+            if message.kind == MessageKind.WRITTEN_FILES:
                 _report_written_files(channel, policy.folder, reported_paths)
                 continue
             try:
@@ -93,15 +93,14 @@ def _report_written_files(channel: MessageChannel, folder: str, reported_paths: 
         folder: folder of the tuner.
         reported_paths: paths that were reported, extended in place.
     """
-    new = [
-        path
-        for path in islice(_iterate_written_files(folder), _MAX_COUNTED_FILES)
-        if path not in reported_paths
-    ]
-    reported_paths.update(new)
+    # Only so many files are looked at, which bounds the time. If a tuner writes more of them, some
+    # are never reported.
+    first_files = islice(_iterate_written_files(folder), _MAX_COUNTED_FILES)
+    new_files = [path for path in first_files if path not in reported_paths]
+    reported_paths.update(new_files)
     # A note names at most three files.
-    names = [os.path.relpath(path, folder) for path in sorted(new)[:3]]
-    channel.send_document(b"N", {"count": len(new), "names": names})
+    names = [os.path.relpath(path, folder) for path in sorted(new_files)[:3]]
+    channel.send_document(MessageKind.WRITTEN_FILES, {"count": len(new_files), "names": names})
 
 
 _MAX_COUNTED_FILES = 10_000
@@ -121,32 +120,31 @@ def _report_failure(channel: MessageChannel, text: str) -> None:
         channel: channel to the parent process.
         text: traceback or message.
     """
-    channel.send(b"D", text.encode("utf-8", "replace")[-MAX_TEXT_BYTES // 2 :])
+    channel.send(MessageKind.FAILURE, text.encode("utf-8", "replace")[-MAX_TEXT_BYTES // 2 :])
 
 
 def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | None) -> Tuner | None:
     """Execute the request of one message, and return the present tuner.
 
-    Message kinds: B builds a tuner, L loads its weights, T runs it on a task, F trains it. `tuner`
-    is None before the first message B.
+    A request builds a tuner, loads its weights, runs it on a task, or trains it.
 
     Args:
         channel: Channel to the harness.
         message: Request of the harness.
-        tuner: Tuner that was built before.
+        tuner: Tuner that was built before; None before the first request.
     """
-    if message.kind == b"B":
+    if message.kind == MessageKind.BUILD:
         description = message.to_document()
         tuner = load_class(description)(**description["options"])
-        channel.send(b"K")
+        channel.send(MessageKind.DONE)
     elif tuner is None:
         raise RuntimeError("a request came before the tuner was built")
-    elif message.kind == b"L":
+    elif message.kind == MessageKind.WEIGHTS:
         tuner.restore(unpack_arrays(message.body))
-        channel.send(b"K")
-    elif message.kind == b"T":
+        channel.send(MessageKind.DONE)
+    elif message.kind == MessageKind.TASK:
         _run_tuner(channel, message, tuner)
-    elif message.kind == b"F":
+    elif message.kind == MessageKind.FIT:
         _train_tuner(channel, message, tuner)
     return tuner
 
@@ -207,13 +205,13 @@ def make_generator(arrays: dict[str, NDArray[Any]]) -> np.random.Generator:
 def _run_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
     """Run the tuner on the task of a message, and exchange its proposals for evaluations.
 
-    Its last message says how the run ended: ``S`` ("stopped") with the tuner's reason, or ``K``
-    ("OK") after the harness closed the run.
+    Its last message says how the run ended: "stopped" with the tuner's reason, or "done" after the
+    harness closed the run.
 
     Args:
         channel: Channel to the harness.
-        message: Message of kind ``T`` ("task"): start point, observed signals, scales of the
-            channels, training data, budget of simulations, and lengths of the runs in samples.
+        message: The task: start point, observed signals, scales of the channels, training range,
+            budget of simulations, and lengths of the runs in samples.
         tuner: Tuner to run.
     """
     arrays = unpack_arrays(message.body)
@@ -233,18 +231,18 @@ def _run_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
     # The generator's return value is the tuner's reason for stopping.
     except StopIteration as stop:
         reason = str(stop.value or "the tuner stopped")
-        channel.send(b"S", reason.encode("utf-8", "replace")[: MAX_TEXT_BYTES // 2])
+        channel.send(MessageKind.STOPPED, reason.encode("utf-8", "replace")[: MAX_TEXT_BYTES // 2])
     # The harness closed the run, for example because the budget is used up.
     except GeneratorExit:
         steps.close()
-        channel.send(b"K")
+        channel.send(MessageKind.DONE)
 
 
 def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: Task) -> NoReturn:
     """Send proposals to the harness, and evaluations to the tuner, until one of them ends the run.
 
-    A message ``A`` ("ask") contains the recommended point, if the tuner states one, and the points
-    to simulate. The answer ``E`` ("evaluation") contains n points as they were simulated, their n
+    A message with proposals contains the recommended point, if the tuner states one, and the points
+    to simulate. The answer, an evaluation, contains n points as they were simulated, their n
     losses, and their observations, one after the other. Any other answer ends the run.
 
     Args:
@@ -269,9 +267,15 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
         points = to_points(proposal, dim, "proposals")
         # One point beyond the budget is enough for the harness to see that the budget is exceeded.
         points = points[: max(task.budget - used_simulations, 0) + 1]
-        channel.send(b"A", recommendation, points, flags=len(recommendation) > 0, size=len(points))
+        channel.send(
+            MessageKind.PROPOSALS,
+            recommendation,
+            points,
+            flags=len(recommendation) > 0,
+            size=len(points),
+        )
         answer = channel.receive(MAX_HARNESS_MESSAGE_BYTES)
-        if answer.kind != b"E":
+        if answer.kind != MessageKind.EVALUATION:
             raise GeneratorExit
         # The flags say on which processor to run, see `cpu_affinity.AffinityController`.
         if answer.flags:
@@ -299,17 +303,17 @@ class _RemoteTrainingSimulator:
             which: 0 for the simulator for training, or `EVALUATION_SIMULATOR_FLAG`.
         """
         self._channel, self._which = channel, which
-        channel.send(b"P", flags=which)
+        channel.send(MessageKind.TRAINING_REQUEST, flags=which)
         self._read_properties(channel.receive(MAX_HARNESS_MESSAGE_BYTES))
 
     def _read_properties(self, answer: Message) -> dict[str, NDArray[Any]]:
         """Store the properties of the training simulator from an answer, and return its arrays.
 
         Every answer contains these properties. `used` and `budget` are the numbers of simulations
-        so far and allowed. An answer of kind X is a refusal by the harness; it is raised here as
-        the exception that a local simulator would raise.
+        so far and allowed. A refusal by the harness is raised here as the exception that a local
+        simulator would raise.
         """
-        if answer.kind == b"X":
+        if answer.kind == MessageKind.REFUSAL:
             refusal = answer.to_document()
             error_types = {"budget": BudgetExceededError, "value": ValueError}
             raise error_types.get(refusal["kind"], RuntimeError)(refusal["says"])
@@ -346,7 +350,9 @@ class _RemoteTrainingSimulator:
         )
         requested = np.array(points, dtype=np.float64).reshape(-1, self.dim)
         request = pack_arrays({"rng": encode_rng_state(rng_state), "points": requested})
-        self._channel.send(b"P", *request, flags=SIMULATE_FLAG | self._which)
+        self._channel.send(
+            MessageKind.TRAINING_REQUEST, *request, flags=SIMULATE_FLAG | self._which
+        )
         arrays = self._read_properties(self._channel.receive(MAX_HARNESS_MESSAGE_BYTES))
         if is_sendable:
             rng.bit_generator.state = decode_rng_state(arrays["rng"])
@@ -364,22 +370,23 @@ class _RemoteTrainingCallback:
         return _RemoteTrainingSimulator(self._channel, EVALUATION_SIMULATOR_FLAG)
 
     def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
-        self._channel.send_document(b"W", [stage, epoch, epochs, float(loss), float(held_out)])
+        report = [stage, epoch, epochs, float(loss), float(held_out)]
+        self._channel.send_document(MessageKind.PROGRESS, report)
         self._channel.receive(MAX_HARNESS_MESSAGE_BYTES)
 
 
 def _train_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
-    """Train the tuner on the harness's training simulator, and send its weights (message L).
+    """Train the tuner on the harness's training simulator, and send its weights.
 
     Progress is reported to the harness if the flags of the message ask for it.
 
     Args:
         channel: Channel to the harness, which simulates.
-        message: Message F with the budget and the state of the random generator.
+        message: Request with the budget and the seed of the random generator.
         tuner: Tuner to train.
     """
     arrays = unpack_arrays(message.body)
     tuner.watch = _RemoteTrainingCallback(channel) if message.flags else None
     tuner.fit(_RemoteTrainingSimulator(channel, 0), make_generator(arrays), int(arrays["budget"]))
     tuner.watch = None
-    channel.send(b"L", *pack_arrays(tuner.state()))
+    channel.send(MessageKind.WEIGHTS, *pack_arrays(tuner.state()))

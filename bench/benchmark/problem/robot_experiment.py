@@ -65,13 +65,14 @@ def complete_robot_experiment(experiment: Experiment) -> Experiment:
     """
     if not experiment.model:
         return experiment
-    kind = get_simulator_class(experiment)
+    simulator_class = get_simulator_class(experiment)
     changes: dict[str, Any] = {}
     if experiment.recording:
         path = find_recording(experiment.recording.path)
-        changes["observe"] = tuple(read_recording(path, kind).runs[0].channels)
-    elif issubclass(kind, SystemSimulator):
-        default_recording = kind.system.usual_recording
+        # The runs are in one table, so they have the same channels.
+        changes["observe"] = tuple(read_recording(path, simulator_class).runs[0].channels)
+    elif issubclass(simulator_class, SystemSimulator):
+        default_recording = simulator_class.system.usual_recording
         changes["observe"] = default_recording.observe
         changes["initial"] = dict(default_recording.initial)
         changes["inputs"] = dict(default_recording.inputs)

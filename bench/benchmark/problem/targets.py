@@ -271,7 +271,7 @@ def _simulate_held_out(
     """Simulate the held-out scenarios of a target, without sensor noise.
 
     Args:
-        problem: problem of the experiment.
+        problem: problem of the experiment; its simulator `world` makes the targets.
         theta: (1, p) true parameters of the target.
         target_streams: random streams of the target, which determine the scenarios.
 

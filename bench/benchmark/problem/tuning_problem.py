@@ -84,12 +84,12 @@ class TuningProblem:
         self.simulated = 0
         self.salt = experiment.salt if salt is None else salt
 
-        kind = get_simulator_class(experiment)
-        observe = experiment.observe or tuple(c.name for c in kind.channels)
-        self.simulator = self._build_simulator(kind, observe, experiment.settings)
+        simulator_class = get_simulator_class(experiment)
+        observe = experiment.observe or tuple(c.name for c in simulator_class.channels)
+        self.simulator = self._build_simulator(simulator_class, observe, experiment.settings)
         self.world = self.simulator
         if experiment.world:
-            self.world = self._build_simulator(kind, observe, experiment.world)
+            self.world = self._build_simulator(simulator_class, observe, experiment.world)
             self._check_world()
 
         self._check_constants()

@@ -143,9 +143,9 @@ def check_comparison_size(
         need = estimate_comparison_need(part, jobs, cluster)
         check_feasible(f"experiment {part.name}", need, get_machine_resources(folder))
         if part.recording:
-            kind = get_simulator_class(part)
+            simulator_class = get_simulator_class(part)
             path = find_recording(part.recording.path)
-            check_recording_plausible(read_recording(path, kind), kind)
+            check_recording_plausible(read_recording(path, simulator_class), simulator_class)
 
 
 def estimate_comparison_need(

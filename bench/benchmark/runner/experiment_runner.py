@@ -150,8 +150,9 @@ def count_seeds(experiment: Experiment, entry: TunerEntry) -> int:
 
     It is the entry's or the experiment's number, or one if the tuner is deterministic.
     """
-    kind = tuners.get(entry.tuner)
-    if not (kind.stochastic or kind.learned):
+    tuner_class = tuners.get(entry.tuner)
+    # A learned tuner is trained with each seed, even if its runs use no random numbers.
+    if not (tuner_class.stochastic or tuner_class.learned):
         return 1
     return entry.seeds or experiment.seeds
 

@@ -15,7 +15,7 @@ from time import perf_counter
 from typing import Any
 
 from bench.benchmark.isolation.isolation_layers import AccessPolicy
-from bench.benchmark.isolation.message_channel import MessageChannel, to_printable
+from bench.benchmark.isolation.message_channel import MessageChannel, MessageKind, to_printable
 from bench.benchmark.isolation.process_errors import RunEndedError, with_isolation
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.experiment_tables import find_named_effects, list_effect_names
@@ -314,10 +314,10 @@ def must_build_isolated(entry: TunerEntry) -> bool:
         PartUnavailableError: the tuner cannot be used here.
     """
     announce_installed([(tuners, entry.tuner)])
-    kind, file = tuners.get(entry.tuner), tuners.place(entry.tuner)
-    if not issubclass(kind, TunerStub):
-        if file is not None:
-            raise _make_untrusted_code_error(entry.label, file)
+    tuner_class, plugin_file = tuners.get(entry.tuner), tuners.place(entry.tuner)
+    if not issubclass(tuner_class, TunerStub):
+        if plugin_file is not None:
+            raise _make_untrusted_code_error(entry.label, plugin_file)
         return False
     try:
         retry_if_killed(lambda: _try_to_build(entry))
@@ -478,7 +478,7 @@ def _request_inspection(question: dict[str, str], files: list[str]) -> Any:
     deadline = perf_counter() + _INSPECTION_TIMEOUT_SECONDS
     try:
         child.wait_until_ready()
-        child.send(b"Q", json.dumps(question).encode(), deadline=deadline)
+        child.send(MessageKind.QUESTION, json.dumps(question).encode(), deadline=deadline)
         return child.receive(_MAX_ANSWER_BYTES, deadline).to_document(_MAX_ANSWER_BYTES)
     finally:
         child.end()
@@ -523,15 +523,14 @@ def serve_inspection(
     """Answer one question about a plugin; runs in the isolated process.
 
     To answer, it must import the plugin, whose code is not trusted. After the answer it waits until
-    the harness ends it. It sends two messages: ``R`` ("ready") with the active layers, and ``K``
-    with the answer, a list of descriptions or ``{"fault": message}``.
+    the harness ends it. The answer is a list of descriptions, or ``{"fault": message}``.
 
     Args:
         channel: channel to the harness.
         _policy: access policy; not used.
         active_layers: names of the active isolation layers.
     """
-    channel.send_document(b"R", active_layers)
+    channel.send_document(MessageKind.READY, active_layers)
     question = channel.receive().to_document()
     try:
         answer: Any = (
@@ -541,7 +540,7 @@ def serve_inspection(
         )
     except InputError as error:
         answer = {"fault": str(error)}
-    channel.send_document(b"K", answer)
+    channel.send_document(MessageKind.DONE, answer)
     # No further message comes; this waits until the harness ends the process.
     channel.receive()
 

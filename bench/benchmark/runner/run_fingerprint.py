@@ -203,15 +203,15 @@ class RunIds:
         """
         # Hashes are cached, because a plan may have a million runs.
         if entry.label not in self._entry_digests:
-            kind = tuners.get(entry.tuner)
-            training_budget = self._experiment.training_budget if kind.learned else 0
+            tuner_class = tuners.get(entry.tuner)
+            training_budget = self._experiment.training_budget if tuner_class.learned else 0
             # The random effects of the training matter only for an entry that trains with them.
             nuisance = [dict(self._experiment.nuisance)] if entry.randomised else []
             self._entry_digests[entry.label] = compute_digest(
                 entry.tuner,
                 dict(entry.options),
                 training_budget,
-                hash_class_source(kind),
+                hash_class_source(tuner_class),
                 *nuisance,
             )
         if target.name not in self._target_digests:

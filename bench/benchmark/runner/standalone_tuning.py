@@ -60,9 +60,9 @@ def run_tuner(
     Raises:
         InputError: there is no such tuner, or it must be trained first.
     """
-    kind = tuners.get(name)
+    tuner_class = tuners.get(name)
     # There is no experiment that defines the training.
-    if kind.learned:
+    if tuner_class.learned:
         raise InputError(
             f"tuner {name} must be trained first; expected one that searches, such as least_squares"
         )
@@ -80,7 +80,7 @@ def run_tuner(
         budget=budget,
         lengths=problem.lengths,
     )
-    trace = drive_tuner(kind(), task, evaluate, rng, seconds)
+    trace = drive_tuner(tuner_class(), task, evaluate, rng, seconds)
     # Even a failed run recommends its last point, so the status is not checked.
     best: Array = cube.to_physical(trace.recommendations[-1])
     return best

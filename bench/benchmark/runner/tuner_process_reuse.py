@@ -94,15 +94,15 @@ def make_part_spec(
         name: registered name.
         options: options with which it is built.
     """
-    # `file` is the plugin file, or None for a part of an installed package.
-    kind, file = registry.get(name), registry.place(name)
+    # A part of an installed package has no plugin file.
+    part_class, plugin_file = registry.get(name), registry.place(name)
     # The class here may be a stub, whose attribute `module` names the module with the code.
-    module = getattr(kind, "module", "") or kind.__module__
-    source_file = str(file) if file else find_source_file(module)
+    module = getattr(part_class, "module", "") or part_class.__module__
+    source_file = str(plugin_file) if plugin_file else find_source_file(module)
     return TunerSpec(
-        kind.name,
+        part_class.name,
         module,
-        str(file or ""),
+        str(plugin_file or ""),
         dict(options or {}),
         find_preloadable_packages(source_file),
     )

@@ -23,6 +23,7 @@ from bench.benchmark.isolation.message_channel import (
     MAX_STATE_BYTES,
     SIMULATE_FLAG,
     Message,
+    MessageKind,
     ProtocolError,
     decode_rng_state,
     encode_rng_state,
@@ -74,8 +75,8 @@ def train_remotely(
 ) -> dict[str, Array]:
     """Train a tuner in its isolated process, while this process simulates for it.
 
-    The training is started by a message ``F`` ("fit"). Then the tuner's messages are answered:
-    requests of simulations and reports of progress, until it sends its trained arrays (``L``).
+    The training is started by a message. Then the tuner's messages are answered: requests of
+    simulations and reports of progress, until it sends its trained arrays.
 
     Args:
         child: process of the tuner.
@@ -91,12 +92,17 @@ def train_remotely(
         KilledExternallyError: its process was killed externally.
     """
     request = {"stream": stream.astype(np.int64), "budget": np.array(simulator.budget)}
-    child.send(b"F", *pack_arrays(request), flags=watch is not None, deadline=_NO_DEADLINE)
+    child.send(
+        MessageKind.FIT,
+        *pack_arrays(request),
+        flags=watch is not None,  # whether to report progress
+        deadline=_NO_DEADLINE,
+    )
     simulators: list[TrainingSimulator] = [simulator]
     while True:
         message = child.receive(MAX_STATE_BYTES, _NO_DEADLINE)
         try:
-            if message.kind == b"L":
+            if message.kind == MessageKind.WEIGHTS:
                 return unpack_arrays(message.body)
             _handle_message(child, message, simulators, watch)
         except ProtocolError as error:
@@ -113,9 +119,9 @@ def _handle_message(
 ) -> None:
     """Answer one message of a tuner during its training.
 
-    Message ``W`` reports progress, and is confirmed by ``K``. Message ``P`` requests simulations.
-    With `EVALUATION_SIMULATOR_FLAG` it uses the simulator for evaluation, which exists only if
-    there is a callback. `SIMULATE_FLAG` is read in `_serve_simulation`.
+    A report of progress is confirmed. A request of simulations is served; with
+    `EVALUATION_SIMULATOR_FLAG` it uses the simulator for evaluation, which exists only if there is
+    a callback. `SIMULATE_FLAG` is read in `_serve_simulation`.
 
     Args:
         child: process of the tuner.
@@ -130,10 +136,11 @@ def _handle_message(
     # The position of the simulator in the list: 0 for training, 1 for evaluation (flag value 1).
     simulator_index = message.flags & EVALUATION_SIMULATOR_FLAG
     has_known_flags = message.flags <= EVALUATION_SIMULATOR_FLAG | SIMULATE_FLAG
-    if message.kind == b"W" and callback is not None:
+    is_request = message.kind == MessageKind.TRAINING_REQUEST and has_known_flags
+    if message.kind == MessageKind.PROGRESS and callback is not None:
         callback.epoch(*_parse_progress(message.to_document()))
-        child.send(b"K", deadline=_NO_DEADLINE)
-    elif message.kind == b"P" and has_known_flags and (callback is not None or not simulator_index):
+        child.send(MessageKind.DONE, deadline=_NO_DEADLINE)
+    elif is_request and (callback is not None or not simulator_index):
         if simulator_index and callback is not None and len(simulators) == 1:
             # `ground` is the simulator with which the callback evaluates the tuner.
             simulators.append(callback.ground)
@@ -161,8 +168,8 @@ def _serve_simulation(
     """Send the properties of a simulator, and simulate if the message requests it.
 
     It serves a learned tuner that trains in an isolated process. Without `SIMULATE_FLAG` only the
-    properties are sent (message ``O``). A request that is not valid, or beyond the budget, is
-    answered by a refusal (message ``X``), and the training can continue.
+    properties are sent. A request that is not valid, or beyond the budget, is answered by a
+    refusal, and the training can continue.
 
     Properties: `training` (2, dim) is the range in the unit cube, `scale` (C,) the scale of each
     channel, `lengths` the number of samples of each run, `scene` the present scenario (initial
@@ -180,7 +187,7 @@ def _serve_simulation(
         except (ValueError, BudgetExceededError) as error:
             kind = "budget" if isinstance(error, BudgetExceededError) else "value"
             refusal = json.dumps({"kind": kind, "says": str(error)}).encode()
-            child.send(b"X", refusal, deadline=_NO_DEADLINE)
+            child.send(MessageKind.REFUSAL, refusal, deadline=_NO_DEADLINE)
             return
     properties = {
         "training": simulator.training,
@@ -190,7 +197,9 @@ def _serve_simulation(
         "inputs": simulator.scene.inputs,
         "counts": np.array([simulator.used, simulator.budget], dtype=np.int64),
     }
-    child.send(b"O", *pack_arrays({**properties, **arrays}), deadline=_NO_DEADLINE)
+    child.send(
+        MessageKind.PROPERTIES, *pack_arrays({**properties, **arrays}), deadline=_NO_DEADLINE
+    )
 
 
 def _simulate_points(message: Message, simulator: TrainingSimulator) -> dict[str, NDArray[Any]]:
@@ -225,9 +234,9 @@ def build_tuner(entry: TunerEntry) -> Tuner:
     Raises:
         InputError: the tuner does not have an option, or refuses its value.
     """
-    kind = tuners.get(entry.tuner)
+    tuner_class = tuners.get(entry.tuner)
     try:
-        return kind(**entry.options)
+        return tuner_class(**entry.options)
     # Python raises a TypeError for an unknown option, and tuners a ValueError for a bad value.
     except (TypeError, ValueError) as error:
         raise InputError(f"tuner {entry.label}: {error}") from None

@@ -32,10 +32,12 @@ ERT_TARGET_LEVELS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)
 
 
 def select_thresholds(curves: RunCurves, simulated: bool) -> tuple[Array, tuple[float, ...]]:
-    """Choose error thresholds of the runtime distribution and of the table of running times (ERT).
+    """Choose error thresholds of the runtime distribution and of the table of running times.
 
-    In simulation they are fixed shares of the training range. For a recording, whose errors have
-    other units, they are between the median initial error and the smallest final error.
+    The running times are expected running times (ERT), the numbers of simulations per success.
+
+    In simulation the thresholds are fixed shares of the training range. For a recording, whose
+    errors have other units, they are between the median initial error and the smallest final error.
 
     Args:
         curves: values of the deciding metric.

@@ -69,6 +69,7 @@ class TuningCost:
         """Compute the seconds per target for a given duration of one simulation.
 
         They are the time of a target itself, simulations and tuner, and its share of a training.
+        The simulations of a target are its expected running time (ERT), those per success.
 
         Args:
             cost: duration of one simulation in seconds, any shape.
@@ -155,7 +156,8 @@ def build_break_even_table(
 ) -> pd.DataFrame:
     """Compare every learned tuner with every search tuner by break-even targets.
 
-    They are the number of targets after which training has paid off.
+    They are the number of targets after which training has paid off. Both tuners are also compared
+    by their expected running time (ERT), the simulations per success.
 
     Args:
         experiment: name of the experiment.
@@ -167,28 +169,32 @@ def build_break_even_table(
         One row per pair with 95 % bootstrap intervals over targets, columns `BREAK_EVEN_COLUMNS`.
     """
     lines = []
-    for name, learned_cost in costs_by_tuner.items():
-        for search_name, search in costs_by_tuner.items():
+    for learned_name, learned_cost in costs_by_tuner.items():
+        for search_name, search_cost in costs_by_tuner.items():
             # Only a trained tuner has a training cost, and it is compared with untrained tuners
             # alone.
-            if not learned_cost.fit_simulations or search.fit_simulations:
+            if not learned_cost.fit_simulations or search_cost.fit_simulations:
                 continue
-            resamples = draw_target_resamples(len(learned_cost.effort.successes), experiment, kind)
+            # `successes` has one number for each target.
+            target_count = len(learned_cost.effort.successes)
+            resamples = draw_target_resamples(target_count, experiment, kind)
             low, high = compute_percentile_interval(
-                compute_break_even_targets(learned_cost, search, resamples)
+                compute_break_even_targets(learned_cost, search_cost, resamples)
             )
-            costs = learned_cost.fit_simulations, learned_cost.fit_seconds
-            erts = float(learned_cost.effort.compute_ert()), float(search.effort.compute_ert())
-            break_even = float(compute_break_even_targets(learned_cost, search))
+            training_cost = learned_cost.fit_simulations, learned_cost.fit_seconds
+            learned_ert = float(learned_cost.effort.compute_ert())
+            search_ert = float(search_cost.effort.compute_ert())
+            break_even = float(compute_break_even_targets(learned_cost, search_cost))
             lines.append(
                 (
                     experiment,
                     kind,
                     threshold,
-                    name,
+                    learned_name,
                     search_name,
-                    *costs,
-                    *erts,
+                    *training_cost,
+                    learned_ert,
+                    search_ert,
                     break_even,
                     low,
                     high,
@@ -212,6 +218,7 @@ def find_cheapest_tuners(
         List of (from, to, tuner): bounds of the duration of one simulation in seconds, and the
         tuner that needs the least time between them. Empty if no tuner reaches the threshold.
     """
+    # The expected running time (ERT) is infinite for a tuner that never reaches the threshold.
     successful_costs = {
         name: cost
         for name, cost in costs_by_tuner.items()
@@ -254,7 +261,8 @@ def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) 
     for kind, by_tuner in prices.items():
         for tuner, price in by_tuner.items():
             seconds = price.compute_seconds_per_target(SIMULATION_COST_GRID, TARGETS_PER_TRAINING)
-            # A logarithmic axis cannot show a tuner that needs 0 seconds.
+            # The expected running time (ERT) is infinite if a tuner never reaches the error. A
+            # logarithmic axis cannot show a tuner that needs 0 seconds.
             if np.isfinite(price.effort.compute_ert()) and seconds[0] > 0:
                 columns = (kind, tuner, SIMULATION_COST_GRID, seconds)
                 tables.append(

@@ -143,10 +143,10 @@ def _count_seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int
     # A single seed is correct for a deterministic tuner. The tuner is loaded only now, since it may
     # import large packages.
     try:
-        kind = tuners.get(entry.tuner)
+        tuner_class = tuners.get(entry.tuner)
     except InputError:  # A tuner of a plugin that is not loaded or cannot be used here.
         return 1
-    return seed_count if kind.stochastic or kind.learned else 1
+    return seed_count if tuner_class.stochastic or tuner_class.learned else 1
 
 
 class CheckedFiles(NamedTuple):

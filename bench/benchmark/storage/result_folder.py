@@ -160,6 +160,7 @@ def read_configuration(folder: Path) -> FolderConfiguration:
         )
     environment = read_environment(folder)
     experiment = parse_experiment(str(environment["experiment"]), read_toml(path), path)
+    # Folders of older versions lack some of the hashes (fingerprint) and isolation layers (seals).
     return FolderConfiguration(
         experiment,
         list(environment["plugins"]),
