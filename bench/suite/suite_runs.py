@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.statistics.error_curves import RunCurves
 from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
@@ -154,16 +156,14 @@ def collect_suite_runs(folder: Path) -> SuiteRuns:
 def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
     """Collect the runs of one comparison of a suite, with its cells and the cost of trainings.
 
-    A cell is a problem with one range of targets. A run that ended early with a smaller budget has
-    NaN for more simulations.
+    A cell is a problem with one range of targets.
 
     Args:
         folder: folder of the comparison.
         condition: ``before`` or ``after`` the extension of a misspecified simulator, else empty.
 
     Returns:
-        Errors are (R, K + 1) for R runs and the budget K: one column for each number of simulations
-        from 0 to K. A failed run has infinite errors.
+        The runs; without runs only the tuners that were skipped.
     """
     stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
     experiment = stored.experiment
@@ -189,14 +189,8 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
             "failed": curves.failed,
         }
     )
-    errors = curves.values.copy()
-    # A run that used up a smaller budget says nothing about more simulations.
-    has_ended_early = (run_statuses["status"] == "done").to_numpy() & (
-        curves.used < experiment.budget
-    )
-    is_after_end = np.arange(errors.shape[1]) > curves.used[:, None]
-    errors[has_ended_early[:, None] & is_after_end] = np.nan
-    errors[curves.failed] = np.inf
+    has_used_budget = (run_statuses["status"] == "done").to_numpy()
+    errors = _replace_unknown_errors(curves, has_used_budget, experiment.budget)
     properties = {
         "problem": problem,
         "parameters": _count_parameters(experiment),
@@ -208,20 +202,42 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
         "identifiable": experiment.identifiable,
         "suite": experiment.suite,
     }
+    # One row for each cell, with the range of its targets.
+    range_by_cell = dict(zip(cells, keys["range"], strict=True))
     cell_rows = [
         {"cell": cell, "range": condition or str(kind), **properties}
-        for cell, kind in dict(zip(cells, keys["range"], strict=True)).items()
+        for cell, kind in range_by_cell.items()
     ]
     training = pd.DataFrame(
-        [
-            (cell, tuner, *cost)
-            for cell in dict.fromkeys(cells)
-            for tuner, cost in stored.costs.items()
-        ],
+        [(cell, tuner, *cost) for cell in range_by_cell for tuner, cost in stored.costs.items()],
         columns=TRAINING_COLUMNS,
     )
     reasons = skipped[SKIPPED_COLUMNS].drop_duplicates("tuner")
     return SuiteRuns(runs, errors, pd.DataFrame(cell_rows, columns=CELL_COLUMNS), training, reasons)
+
+
+def _replace_unknown_errors(
+    curves: RunCurves, has_used_budget: NDArray[np.bool_], budget: int
+) -> Array:
+    """Return the errors of runs, with NaN where they are unknown and infinity where a run failed.
+
+    A run that has used up a smaller budget than the experiment's says nothing about more
+    simulations. A run that stopped by itself keeps its last error.
+
+    Args:
+        curves: errors of R runs after 0 to K simulations.
+        has_used_budget: (R,) True for a run that ended because its budget was used up.
+        budget: number of simulations of the experiment; a tuner may have a smaller one.
+
+    Returns:
+        (R, K + 1) errors.
+    """
+    errors = curves.values.copy()
+    has_smaller_budget = has_used_budget & (curves.used < budget)
+    is_after_end = np.arange(errors.shape[1]) > curves.used[:, None]
+    errors[has_smaller_budget[:, None] & is_after_end] = np.nan
+    errors[curves.failed] = np.inf
+    return errors
 
 
 def name_cell(problem: str, kind: str, condition: str, experiment: Experiment) -> str:

@@ -82,9 +82,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     from bench.core.plugin_registries import load_plugins
     from bench.figures.recording_figure import write_recording_figure
     from bench.logs import recording_summary
-    from bench.logs.quality.clock_checks import find_anomalies
-    from bench.logs.quality.log_quality import check_log_quality, find_log_anomalies
-    from bench.logs.quality.pose_check import find_missing_base_poses
+    from bench.logs.quality.log_quality import check_log_quality
     from bench.logs.recording_loading import load_recording
     from bench.logs.recording_summary import format_summary
     from sims.core.simulator import InputError
@@ -96,15 +94,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
         options.recording, options.system, options.model, fix_base=options.fix_base
     )
     robot_lines = list(recording_summary.format_robot_summary(kind))
-    oddities = [
-        *find_log_anomalies(recording),
-        *find_anomalies(recording, kind),
-        *find_missing_base_poses(recording, kind),
-    ]
-    warnings_to_print = [
-        *(oddity.text for oddity in oddities),
-        *recording_summary.format_log_warnings(recording, kind),
-    ]
+    warnings_to_print = _list_warnings(recording, kind)
     findings = list(check_log_quality(recording, kind))
     active_recording, inactive = _remove_inactive_drives(recording, kind)
     findings += inactive
@@ -133,15 +123,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
         "robot": robot_lines,
         "odd": warnings_to_print,
         "findings": [finding._asdict() for finding in findings],
-        "conventions": [
-            {
-                "text": difference.hypothesis.description,
-                "alternatives": [
-                    alternative.description for alternative in difference.alternatives
-                ],
-            }
-            for difference in differences
-        ],
+        "conventions": [_make_convention_document(difference) for difference in differences],
         "fixes": settings_to_fix,
         "check": numbers,
         "files": files,
@@ -150,6 +132,43 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
         number["free"] and number["word"] == "not identifiable" for number in numbers or ()
     )
     return CommandResult(document, EXIT_PROBLEMS_FOUND if has_unidentifiable else EXIT_OK)
+
+
+def _list_warnings(recording: Recording, kind: type[Simulator]) -> list[str]:
+    """List what looks wrong in a recording.
+
+    These are omissions of its logs, time stamps, missing initial poses, and signals that are
+    missing or beyond limits.
+
+    Args:
+        recording: recorded runs, with their channels, inputs and constants.
+        kind: simulator class.
+    """
+    from bench.logs import recording_summary
+    from bench.logs.quality.clock_checks import find_anomalies
+    from bench.logs.quality.log_quality import find_log_anomalies
+    from bench.logs.quality.pose_check import find_missing_base_poses
+
+    oddities = [
+        *find_log_anomalies(recording),
+        *find_anomalies(recording, kind),
+        *find_missing_base_poses(recording, kind),
+    ]
+    return [
+        *(oddity.text for oddity in oddities),
+        *recording_summary.format_log_warnings(recording, kind),
+    ]
+
+
+def _make_convention_document(difference: ConventionDifference) -> JsonDocument:
+    """Convert a convention that differs from the model file to a JSON document.
+
+    Its alternatives are other conventions that explain the recording equally well.
+    """
+    return {
+        "text": difference.hypothesis.description,
+        "alternatives": [alternative.description for alternative in difference.alternatives],
+    }
 
 
 def _remove_inactive_drives(
