@@ -93,7 +93,7 @@ def _report_written_files(channel: MessageChannel, folder: str, reported_paths: 
         folder: folder of the tuner.
         reported_paths: paths that were reported, extended in place.
     """
-    # Only so many files are looked at, which bounds the time. If a tuner writes more of them, some
+    # The number of files is limited, which bounds the time. If a tuner writes more of them, some
     # are never reported.
     first_files = islice(_iterate_written_files(folder), _MAX_COUNTED_FILES)
     new_files = [path for path in first_files if path not in reported_paths]

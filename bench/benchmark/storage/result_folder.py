@@ -160,7 +160,7 @@ def read_configuration(folder: Path) -> FolderConfiguration:
         )
     environment = read_environment(folder)
     experiment = parse_experiment(str(environment["experiment"]), read_toml(path), path)
-    # Folders of older versions lack some of the hashes (fingerprint) and isolation layers (seals).
+    # Folders of older versions lack some of the hashes and the isolation layers.
     return FolderConfiguration(
         experiment,
         list(environment["plugins"]),
