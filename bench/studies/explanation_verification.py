@@ -204,36 +204,18 @@ def _score_extended_model(
             f"held-out error: {location} in it (simgap bundle --with LOG.csv)"
         )
         return
-    hashes = {
-        recording["file"]: recording["sha256"] for recording in environment.get("recordings", [])
-    }
-    for path in (tables[0], tables[0].with_suffix(".toml")):
-        if path.name in hashes and path.is_file() and compute_sha256(path) != hashes[path.name]:
-            expected = (
-                f"expected the recording that was explained, SHA-256 {hashes[path.name][:12]}"
-            )
-            verification.doubts.append(
-                VerificationFailure(
-                    f"{RECORDINGS_FOLDER}/{path.name}", 0, f"{expected}; found another"
-                )
-            )
-            return
+    failure = _find_other_recording(tables[0], environment)
+    if failure is not None:
+        verification.doubts.append(failure)
+        return
     try:
         result = score_model(folder / EXTENDED_MODEL_FILE, tables[0], held_out=True)
     except InputError as error:
         verification.unchecked.append(f"held-out error: {str(error).replace(f'{folder}/', '')}")
         return
-    assert verdict.heldout is not None
-    # The stated error is the root mean square over the channels that have its unit.
-    units = result["units"]
-    errors_in_unit = [
-        e for name, e in result["rmse"].items() if units[name] == verdict.heldout.unit
-    ]
-    repeated_error = (
-        math.sqrt(sum(e * e for e in errors_in_unit) / len(errors_in_unit))
-        if errors_in_unit
-        else math.nan
-    )
+    assert verdict.heldout is not None  # because it states an error
+    repeated_error = _combine_errors(result["rmse"], result["units"], verdict.heldout.unit)
+    # NaN, which means that no channel has the unit, also counts as a difference.
     if not math.isclose(stated_error, repeated_error, rel_tol=_ERROR_TOLERANCE):
         difference = (
             f"rmse_extended on held-out runs: {stated_error:.6g}, recomputed {repeated_error:.6g}"
@@ -241,6 +223,49 @@ def _score_extended_model(
         verification.doubts.append(VerificationFailure(VERDICT_FILE, 0, difference))
         return
     note(f"{VERDICT_FILE}: rmse_extended on held-out runs is reproduced: {repeated_error:.6g}")
+
+
+def _find_other_recording(
+    table: Path, environment: Mapping[str, Any]
+) -> VerificationFailure | None:
+    """Return a failure if a recording is not the one that was explained, and None otherwise.
+
+    Args:
+        table: table of the recording; its description is the TOML file of the same name.
+        environment: content of the explanation's environment file, with the SHA-256 of each file
+            that was explained. A file without a hash is not checked.
+    """
+    hashes = {
+        recording["file"]: recording["sha256"] for recording in environment.get("recordings", [])
+    }
+    for path in (table, table.with_suffix(".toml")):
+        if path.name in hashes and path.is_file() and compute_sha256(path) != hashes[path.name]:
+            expected = (
+                f"expected the recording that was explained, SHA-256 {hashes[path.name][:12]}"
+            )
+            return VerificationFailure(
+                f"{RECORDINGS_FOLDER}/{path.name}", 0, f"{expected}; found another"
+            )
+    return None
+
+
+def _combine_errors(
+    rmse_by_channel: Mapping[str, float], units: Mapping[str, str], unit: str
+) -> float:
+    """Return the root mean square of the errors of those channels that have a given unit.
+
+    Args:
+        rmse_by_channel: root-mean-square error of each channel, in its unit.
+        units: unit of each channel.
+        unit: unit of the combined error.
+
+    Returns:
+        Combined error; NaN if no channel has the unit.
+    """
+    errors = [error for name, error in rmse_by_channel.items() if units[name] == unit]
+    if not errors:
+        return math.nan
+    return math.sqrt(sum(error * error for error in errors) / len(errors))
 
 
 RECORDINGS_FOLDER = "recordings"

@@ -167,7 +167,9 @@ def estimate_comparison_need(
     # For a bounce shot this counts its shots with one ball; it has only a few balls.
     targets = experiment.targets * len(experiment.ranges)
     seeds_and_budgets = [
-        (count_seeds(experiment, e), e.budget or experiment.budget) for e in sizes.tuners
+        # A tuner may have its own budget; otherwise that of the experiment applies.
+        (count_seeds(experiment, entry), entry.budget or experiment.budget)
+        for entry in sizes.tuners
     ]
     runs = targets * sum(seeds for seeds, _ in seeds_and_budgets)
     simulations = targets * sum(seeds * budget for seeds, budget in seeds_and_budgets)

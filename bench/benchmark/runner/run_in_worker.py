@@ -183,6 +183,7 @@ def _execute_once(
     started = perf_counter()
     written, import_seconds = NOTHING_WRITTEN, 0.0
     if request.tuned is None:
+        # The tuner is trusted and runs in this process.
         rng = make_rng(*_list_stream_names(experiment, request))
         with limited_memory(experiment.memory):
             trace = drive_tuner(_build_tuner(request), task, evaluator, rng, experiment.timeout)
@@ -194,7 +195,7 @@ def _execute_once(
 
         trace, written, import_seconds = _run_isolated(experiment, request, task, evaluate)
     seconds = perf_counter() - started
-    # A trusted tuner runs in this process, and could simulate without the harness.
+    # A trusted tuner could call the simulator itself, and so simulate outside its budget.
     hidden_simulations = problem.simulated - simulated_before - len(trace.losses)
     # A crashed run is exempt: a simulator that raises an error has counted simulations that have no
     # result.

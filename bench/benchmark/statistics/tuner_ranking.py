@@ -205,6 +205,7 @@ def _build_verdict_rows(
     )
     lines = []
     for tuner in order:
+        # Without a test, as for the best tuner itself, the p-value is NaN.
         test, p_holm = tests[tuner], corrected.get(tuner, np.nan)
         if tuner not in successful_tuners:
             verdict = FAILED

@@ -296,6 +296,29 @@ def check_statuses(
     )
     check_known(statuses["tuner"], list_tuner_labels(experiment), "tuner", make_error)
     check_known(statuses["simulator"], [experiment.simulator], "simulator", make_error)
+    _check_run_ids(statuses, make_error)
+    is_executed = statuses["status"] != "skipped"
+    executed_rows = np.flatnonzero(is_executed)
+    check_known(
+        statuses["target"][is_executed],
+        list_target_names(experiment),
+        "target",
+        # `row` counts only the executed runs.
+        lambda row, reason: make_error(int(executed_rows[row]), reason),
+    )
+    _check_simulation_counts(statuses, experiment, make_error)
+
+
+def _check_run_ids(statuses: pd.DataFrame, make_error: RowErrorFactory) -> None:
+    """Check that the id of each run begins with its tuner, target and seed.
+
+    Args:
+        statuses: Rows with the columns of `table_schemas.STATUS_COLUMNS`.
+        make_error: Makes the error for a row.
+
+    Raises:
+        InputError: An id is not valid.
+    """
     skipped = statuses["status"] == "skipped"
     id_prefixes = (
         statuses["tuner"] + "/" + statuses["target"] + "/" + statuses["seed"].astype(str) + "/"
@@ -315,12 +338,22 @@ def check_statuses(
             f"found {statuses['run'].iloc[row]}"
         ),
     )
-    check_known(
-        statuses["target"][~skipped],
-        list_target_names(experiment),
-        "target",
-        lambda row, reason: make_error(int(np.flatnonzero(~skipped)[row]), reason),
-    )
+
+
+def _check_simulation_counts(
+    statuses: pd.DataFrame, experiment: Experiment, make_error: RowErrorFactory
+) -> None:
+    """Check that the number of simulations of each run fits its tuner's budget and its status.
+
+    Args:
+        statuses: Rows with the columns of `table_schemas.STATUS_COLUMNS`.
+        experiment: Content of the experiment's TOML file, with the budgets.
+        make_error: Makes the error for a row.
+
+    Raises:
+        InputError: A run has more simulations than its budget, or is done with fewer.
+    """
+    # A tuner may have its own budget; otherwise that of the experiment applies.
     budgets = {entry.label: entry.budget or experiment.budget for entry in experiment.tuners}
     budget = statuses["tuner"].map(budgets).astype(np.int64)  # Also for an empty column.
     simulations = statuses["simulations"]
