@@ -364,7 +364,8 @@ def _find_competing_effects(
     every other effect are comparable. Compared are gains in twice the log-likelihood minus the
     penalty of the effect. The result contains
 
-    - at most `MAX_COMPETING_EFFECTS` effects whose gain is nearly as large;
+    - at most `MAX_COMPETING_EFFECTS` effects whose gain is nearly as large, not counting families
+      (effects at every place, ``@*``) in place of an effect at one place;
     - effects of the joint or servo model at the same joint that gain much less, because the linear
       regression is inaccurate for large effects;
     - in place of a delay or a lag, all similar ones, with the same coefficient.
@@ -389,7 +390,8 @@ def _find_competing_effects(
         is_promising = effect in same_joint and gain > MIN_SAME_JOINT_GAIN_SHARE * own_gain
         # A law that contains this one never replaces it.
         if (is_near or is_promising) and name not in evaluator.available_effects[effect].contains:
-            near_count += is_near
+            # A family hardly ever wins against an effect at one place, so it takes nobody's turn.
+            near_count += is_near and (name.endswith("@*") or not effect.endswith("@*"))
             coefficients = context.columns.solve_alone(remaining, group)
             competing_effects[effect] = _CompetingEffect(effect, coefficients, loss)
     coefficients = model.fit.theta[evaluator.coefficient_slices[name]]
