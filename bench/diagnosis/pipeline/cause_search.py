@@ -91,7 +91,7 @@ class CauseSearch:
     def _search_with_stiff_friction(
         self, base: BaseModel, search: EffectSearch, rng: np.random.Generator
     ) -> SearchResult:
-        """Search for causes, and compare the forms of dry friction that the base model contains.
+        """Search for causes, and compare the forms of dry friction that the search did not compare.
 
         Args:
             base: base model, fitted with stiff friction.
@@ -106,10 +106,15 @@ class CauseSearch:
         """
         runs = base.runs
         result = self._find_causes(base, search, rng)
-        # The search itself compares the forms of friction that it selects, but not of friction that
-        # is a free number of the model file, which is in the base model.
+        # The search itself compares the forms of friction that it selects, unless stiff friction
+        # nearly explains the runs. It does not compare those of friction that is a free number of
+        # the model file, which is in the base model.
+        has_free_friction = has_dry_friction(runs.fitting, ())
+        # A model that stays incomplete leaves far more than the difference of the two forms.
+        is_settled = result.is_explained or result.finding.is_incomplete
+        compared_effects = () if is_settled else result.finding.model.effects
         is_comparison_needed = (
-            has_dry_friction(runs.fitting, ())
+            has_dry_friction(runs.fitting, compared_effects)
             and not result.errors
             and not runs.context.search_control.is_over()
         )
@@ -118,7 +123,14 @@ class CauseSearch:
         soft_model = refit_if_likelier_soft(
             search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
         )
-        return result if soft_model is None else self._search_with_soft_friction(base, search)
+        if soft_model is None:
+            return result
+        soft_result = self._search_with_soft_friction(base, search, soft_model.fit.make_start())
+        if has_free_friction or soft_result.is_explained:
+            return soft_result
+        # Soft friction of an effect may only imitate what the model lacks.
+        runs.context.say(STIFF_FRICTION)
+        return result
 
     def _repeat_with_stiff_friction(
         self,

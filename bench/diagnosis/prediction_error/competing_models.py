@@ -21,6 +21,7 @@ from bench.diagnosis.prediction_error.effects_at_joints import (
     is_time_shift,
     list_at_coupled_joints,
     list_joint_model_effects,
+    list_similar_dampings,
     list_similar_inertias,
     list_similar_shifts,
 )
@@ -508,8 +509,8 @@ def _fit_at_related_places(context: SearchContext, size: int) -> None:
     """Fit the best models of a size with effects moved to places where they may act alike.
 
     Joints of a closed loop move together, so the data may not show at which of them an effect acts.
-    The same holds for a payload and the bodies of a joint, and for masses and inertias. The fitted
-    models are added to `search.models`.
+    The same holds for a payload and the bodies of a joint, for masses and inertias, and for the
+    damping of a joint and that of its servo. The fitted models are added to `search.models`.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -523,10 +524,16 @@ def _fit_at_related_places(context: SearchContext, size: int) -> None:
             moved = [(other, coefficients) for other in list_at_coupled_joints(evaluator, name)]
             moved += list_moved_payloads(evaluator, name, coefficients)
             moved += list_similar_inertias(evaluator, name, coefficients)
+            moved += list_similar_dampings(evaluator, name, coefficients)
             for other, other_coefficients in moved:
                 start = make_replacing_start(evaluator, model, [name], other, other_coefficients)
                 key = frozenset(start.effects)
-                if other not in model.effects and key not in search.models:
+                known_fit = search.models.get(key)
+                # A fit from another start that is worse than the base model has failed.
+                has_failed = known_fit is not None and (
+                    known_fit.penalised_log_likelihood < search.base_model.penalised_log_likelihood
+                )
+                if other not in model.effects and (known_fit is None or has_failed):
                     starts[key] = start
     if starts:
         search.refit_models(list(starts.values()), is_racing=False)

@@ -29,6 +29,7 @@ from bench.diagnosis.prediction_error.effects_at_joints import (
     SERVO_MODEL,
     SET_POINT_MODEL,
     get_joint_name,
+    get_servo_damping,
     get_servo_input,
     list_moved_bodies,
     list_similar_shifts,
@@ -358,21 +359,14 @@ class EffectProposals:
             change: first change of the joint's damping, in N·m·s/rad or N·s/m.
             gain: gain in log-likelihood that this change predicts.
         """
-        evaluator = self.filters.evaluator
-        assert isinstance(evaluator.simulator, RobotSimulator)
-        servo = get_servo_input(evaluator, joint).removeprefix("u.")
-        name, robot = f"actuator.damping@{servo}", evaluator.simulator.robot
-        if name not in evaluator.library:
+        servo_damping = get_servo_damping(self.filters.evaluator, joint)
+        if servo_damping is None:
             return change, gain
+        name, damping = servo_damping
         servo_change, servo_gain = self._compute_first_change(followed, name)
         if servo_gain < gain + self.filters.penalty(name):
             return change, gain
-        # The third bias parameter of MuJoCo's servo is minus its damping; the coefficient of the
-        # effect is a relative change of it.
-        actuator = robot.actuator(servo).id
-        gear = float(robot.compiled.actuator_gear[actuator, 0])
-        damping = -float(robot.compiled.actuator_biasprm[actuator, 2])
-        return gear**2 * damping * servo_change, servo_gain
+        return damping * servo_change, servo_gain
 
     def compute_largest_gain_of_others(self, friction: str) -> float:
         """Return the largest gain in log-likelihood by another effect where dry friction acts.

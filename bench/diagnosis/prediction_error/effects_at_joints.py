@@ -241,6 +241,57 @@ def list_similar_inertias(
     return [(other, np.clip(c, *ends)) for (other, c), ends in zip(known, bounds, strict=True)]
 
 
+def get_servo_damping(evaluator: RunEvaluator, joint: int) -> tuple[str, float] | None:
+    """Return the effect that scales a servo's damping, and the damping of its joint per unit of it.
+
+    Args:
+        evaluator: the runs of a robot.
+        joint: index of the joint.
+
+    Returns:
+        Name of the effect, and the damping in N·m·s/rad (N·s/m for a slider) that it adds to the
+        joint by a relative change of 1; None if no servo with a known damping drives the joint.
+    """
+    simulator = evaluator.simulator
+    servo = get_servo_input(evaluator, joint).removeprefix("u.")
+    name = f"actuator.damping@{servo}"
+    if not isinstance(simulator, RobotSimulator) or name not in evaluator.library:
+        return None
+    # The third bias parameter of MuJoCo's servo is minus its damping.
+    actuator, model = simulator.robot.actuator(servo).id, simulator.robot.compiled
+    gear, damping = model.actuator_gear[actuator, 0], -model.actuator_biasprm[actuator, 2]
+    return name, float(gear**2 * damping)
+
+
+def list_similar_dampings(
+    evaluator: RunEvaluator, name: str, coefficients: Array
+) -> list[tuple[str, Array]]:
+    """Return the damping of the servo for that of its joint, and the reverse.
+
+    Both are the same force unless the servo is at its force limit. There the joint may chatter, so
+    that a regression finds a wrong coefficient of one of them.
+
+    Args:
+        evaluator: the runs.
+        name: name of the effect, such as ``drag.linear@elbow`` or ``actuator.damping@servo``.
+        coefficients: (1,) its coefficient.
+
+    Returns:
+        Name and coefficient (1,) of the other effect, if the evaluator has it.
+    """
+    for joint in range(len(evaluator.simulator.system.coordinates)):
+        servo_damping = get_servo_damping(evaluator, joint)
+        if servo_damping is None:
+            continue
+        servo_effect, damping = servo_damping
+        joint_effect = f"drag.linear@{get_joint_name(evaluator, joint)}"
+        if name == servo_effect and joint_effect in evaluator.coefficient_slices:
+            return [(joint_effect, coefficients * damping)]
+        if name == joint_effect:
+            return [(servo_effect, coefficients / damping)]
+    return []
+
+
 def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     """Return the names of an effect at the other joints of its kinematic loop.
 

@@ -167,6 +167,9 @@ class RobotDiagnosis(Diagnosis):
         if model is None or gain <= 0.0:
             return
         reach = INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO + MAX_REFIT_GAIN_RATIO * gain
+        # Where servos are at their force limits, the number of first states that the data determine
+        # may differ by one between fits that are not final.
+        reach += search.parameter_penalty
         competitors = [
             other
             for other in search.models.values()
