@@ -6,6 +6,7 @@ Each effect of the best set is replaced in turn by another one, or moved to anot
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -535,8 +536,17 @@ def _fit_at_related_places(context: SearchContext, size: int) -> None:
                 )
                 if other not in model.effects and (known_fit is None or has_failed):
                     starts[key] = start
-    if starts:
-        search.refit_models(list(starts.values()), is_racing=False)
+    # A servo at its force limit may chatter in a simulation from the first states of another model.
+    # Those of the filter are tried, too.
+    filtered_states = context.filters.estimate_first_states(context.filters.base)
+    both_starts = [
+        replace(start, initial_states=states)
+        for start in starts.values()
+        for states in (start.initial_states, filtered_states)
+    ]
+    rated_starts = select_lowest_of_each(context, both_starts)
+    if rated_starts:
+        search.refit_models([rated.start for rated in rated_starts], is_racing=False)
 
 
 def _refine_near(context: SearchContext, size: int) -> None:

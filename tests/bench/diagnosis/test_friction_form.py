@@ -237,3 +237,51 @@ def test_a_soft_search_is_repeated_only_for_a_model_that_it_did_not_fit(
     assert (len(results), errors) == (soft_searches, [])
     # The last message is that of the returned result.
     assert said[-2:] == [cause_search.STIFF_FRICTION, cause_search.SOFT_FRICTION]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "soft_verdict", "is_incomplete", "chosen"),
+    [
+        ("partial", "named", False, "soft"),
+        ("partial", "partial", False, "stiff"),
+        # Nothing is left to explain, or far more than the other form could change.
+        ("named", None, False, "stiff"),
+        ("partial", None, True, "stiff"),
+    ],
+)
+def test_forms_are_compared_if_friction_leaves_more_than_noise(
+    monkeypatch, verdict, soft_verdict, is_incomplete, chosen
+):
+    """The search does not compare them if stiff friction nearly explains the runs."""
+
+    def make_result(verdict):
+        model = SimpleNamespace(effects=("friction.coulomb@elbow",))
+        finding = SimpleNamespace(verdict=verdict, model=model, is_incomplete=is_incomplete)
+        is_explained = verdict == "named"
+        return SimpleNamespace(finding=finding, errors=(), is_explained=is_explained)
+
+    def search_with_soft_friction(_, base, search, start):
+        assert (base.fit, search, start) == ("base fit", "search", "soft start")
+        said.append(cause_search.SOFT_FRICTION)
+        return results["soft"]
+
+    said, results = [], {"stiff": make_result(verdict), "soft": make_result(soft_verdict)}
+    soft_model = SimpleNamespace(fit=SimpleNamespace(make_start=lambda: "soft start"))
+    monkeypatch.setattr(cause_search, "has_dry_friction", lambda _, names: bool(names))
+    monkeypatch.setattr(cause_search, "refit_if_likelier_soft", lambda *_: soft_model)
+    monkeypatch.setattr(cause_search.CauseSearch, "_find_causes", lambda *_: results["stiff"])
+    monkeypatch.setattr(
+        cause_search.CauseSearch, "_search_with_soft_friction", search_with_soft_friction
+    )
+    control = SimpleNamespace(is_over=lambda: False)
+    runs = SimpleNamespace(
+        context=SimpleNamespace(say=said.append, search_control=control),
+        kind=SimpleNamespace(has_model=True),
+        fitting=None,
+        make_rng=lambda: None,
+        create_search=lambda *_: "search",
+    )
+    base = SimpleNamespace(runs=runs, fit="base fit")
+    assert cause_search.CauseSearch(None).search(base) is results[chosen]
+    messages = [cause_search.SOFT_FRICTION, cause_search.STIFF_FRICTION]
+    assert said == messages[: 0 if soft_verdict is None else 1 if chosen == "soft" else 2]

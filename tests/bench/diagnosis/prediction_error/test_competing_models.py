@@ -149,3 +149,40 @@ def test_one_effect_that_acts_like_two_is_preferred(monkeypatch, loss, is_replac
     )
     chosen = competing_models.fit_single_in_place(context, best)
     assert chosen is (single if is_replaced else best)
+
+
+def test_families_take_no_place_of_effects_at_one_place(monkeypatch):
+    """A heavier hip acts nearly like an offset of its servo, and so do offsets of all servos."""
+    losses = {
+        "input.bias@*": 1.0,
+        "sensor.bias@*": 2.0,
+        **{f"force.bias@joint{number}": 3.0 + number for number in range(4)},
+        "gravity.compensation@*": 9.0,
+        "mass.scale@hip": 10.0,
+        "mass.scale@thigh": 11.0,
+    }
+    groups = [SimpleNamespace(effect=name) for name in losses]
+    remaining = SimpleNamespace(
+        compute_gain=lambda _: 100.0,
+        rank_effects=lambda: [(g, 100.0 - losses[g.effect]) for g in groups],
+    )
+    regression = SimpleNamespace(make_regression_without=lambda _: remaining)
+    own = {"sensor.eccentricity@hip": [0]}
+    columns = SimpleNamespace(
+        regression=lambda _: (regression, own), solve_alone=lambda *_: np.ones(1)
+    )
+    effects = {name: SimpleNamespace(contains=()) for name in losses}
+    evaluator = SimpleNamespace(
+        library=list(losses),
+        available_effects=effects,
+        coefficient_slices={"sensor.eccentricity@hip": slice(0, 1)},
+    )
+    filters = SimpleNamespace(penalty=lambda _: 0.0)
+    context = SimpleNamespace(evaluator=evaluator, columns=columns, filters=filters)
+    monkeypatch.setattr(competing_models, "list_joint_model_effects", lambda *_: set())
+    monkeypatch.setattr(competing_models, "list_similar_shifts", lambda *_: [])
+    fit = SimpleNamespace(theta=np.ones(1))
+    model = SimpleNamespace(effects=("sensor.eccentricity@hip",), fit=fit)
+    found = competing_models._find_competing_effects(context, model, "sensor.eccentricity@hip")
+    # Five effects at one place, and the families that come before the fifth.
+    assert [one.effect for one in found] == list(losses)[:-1]
