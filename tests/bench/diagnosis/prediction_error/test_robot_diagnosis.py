@@ -19,6 +19,7 @@ def refit(gain, *others, effects=("a",)):
     diagnosis._model = best
     diagnosis._robot = SimpleNamespace(
         models={frozenset(m.effects): m for m in (best, *others)},
+        parameter_penalty=6.0,
         fit_to_convergence=lambda m: refitted.append(m.effects),
     )
     diagnosis._refit_near_competitors(gain)
@@ -30,7 +31,8 @@ def refit(gain, *others, effects=("a",)):
 )
 def test_competitors_that_the_final_fit_left_behind_are_refitted(gain, expected):
     """An equal effect is behind by the gain of the final fit, which only the best model got."""
-    near, far = model("b", likelihood=1000.0 - 11.0), model("c", likelihood=1000.0 - 50.0)
+    # The limit is 7 + 6 + 2 times the gain: 35 and 63.
+    near, far = model("b", likelihood=1000.0 - 34.0), model("c", likelihood=1000.0 - 62.0)
     assert refit(gain, far, near) == expected
 
 
