@@ -5,7 +5,7 @@ Each effect of the best set is replaced in turn by another one, or moved to anot
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -453,17 +453,21 @@ def _confirm_by_simulation(
         start: start of a fit of the competing model; its coefficient is scaled.
     """
     limit = best.fit.cost + MAX_SINGLE_SQUARES_SHARE * context.search.base_model.fit.cost
-    factors = np.array(COMPETING_FACTORS)
+    name, factors = competing_effect.effect, np.array(COMPETING_FACTORS)
+    # Readings that are late shift the first states, a command that comes late does not.
+    is_shift = is_time_shift(context.evaluator.available_effects[name])
+    same_effect_starts = _add_filtered_states(context, [start]) if is_shift else [start]
     # The second round is between the neighbours of the best factor of the first one.
     for _ in range(2):
         starts = [
-            scale_effect(context, start, competing_effect.effect, factor)
+            scale_effect(context, unscaled, name, factor)
+            for unscaled in same_effect_starts
             for factor in factors.tolist()
         ]
         ((cost, lowest),) = select_lowest_of_each(context, starts)
         if cost < limit:
             return lowest
-        number = next(i for i, scaled in enumerate(starts) if scaled is lowest)
+        number = next(i for i, scaled in enumerate(starts) if scaled is lowest) % factors.size
         first, last = factors[max(number - 1, 0)], factors[min(number + 1, factors.size - 1)]
         factors = np.geomspace(first, last, factors.size + 2)[1:-1]
     return None
@@ -537,16 +541,23 @@ def _fit_at_related_places(context: SearchContext, size: int) -> None:
                 if other not in model.effects and (known_fit is None or has_failed):
                     starts[key] = start
     # A servo at its force limit may chatter in a simulation from the first states of another model.
-    # Those of the filter are tried, too.
-    filtered_states = context.filters.estimate_first_states(context.filters.base)
-    both_starts = [
-        replace(start, initial_states=states)
-        for start in starts.values()
-        for states in (start.initial_states, filtered_states)
-    ]
-    rated_starts = select_lowest_of_each(context, both_starts)
+    rated_starts = select_lowest_of_each(context, _add_filtered_states(context, starts.values()))
     if rated_starts:
         search.refit_models([rated.start for rated in rated_starts], is_racing=False)
+
+
+def _add_filtered_states(context: SearchContext, starts: Iterable[FitStart]) -> list[FitStart]:
+    """Return starts with their own first states, and again with those of the base model's filter.
+
+    The own first states are those of a model with another effect. The filter's are estimated from
+    the readings, and so biased by neither.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        starts: starts of fits.
+    """
+    states = context.filters.estimate_first_states(context.filters.base)
+    return [both for start in starts for both in (start, replace(start, initial_states=states))]
 
 
 def _refine_near(context: SearchContext, size: int) -> None:
