@@ -308,18 +308,21 @@ def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
 
 
 def remove_idle_effects(context: SearchContext, model: FittedModel) -> FittedModel:
-    """Remove effects that gain less than their penalty, and simplify families.
+    """Remove effects that gain less than their penalty, and simplify families and richer laws.
 
     The same effect at every place becomes one effect for all places, its family (``@*``). A family
-    is replaced by a single member that is as good.
+    is replaced by a single member that is as good, and a law by a simpler one that it contains.
 
     Args:
         context: search, filters and regressions of the recording.
         model: the fitted model.
     """
     model = _merge_into_families(context, context.search.drop_unneeded_effects(model))
-    families = any(name.endswith("@*") for name in model.effects)
-    return context.search.simplify_laws(model) if families else model
+    search = context.search
+    is_reducible = any(
+        name.endswith("@*") or search.find_contained_slices(name) for name in model.effects
+    )
+    return search.simplify_laws(model) if is_reducible else model
 
 
 def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedModel:
