@@ -373,9 +373,9 @@ def compute_joint_ranks(ranked: pd.DataFrame, metric: str) -> JointRanks:
         system_count, tuner_count = tables[model].shape
         if system_count >= MIN_PROBLEMS_FOR_RANKS and tuner_count >= 3:
             friedman[model], p_values = compute_nemenyi_p_values(tables[model])
-            # Each pair is once above the diagonal; the other elements of `upper` are 0.
-            upper = np.triu(p_values.to_numpy(), k=1)
-            significant_pairs[model] = int(((upper > 0) & (upper < SIGNIFICANCE_LEVEL)).sum())
+            # Each pair is once above the diagonal.
+            pairs = np.triu_indices(len(p_values), k=1)
+            significant_pairs[model] = int((p_values.to_numpy()[pairs] < SIGNIFICANCE_LEVEL).sum())
     tuners = [t for t in tables[PLAIN] if t in tables[EXTENDED]]
     mean_ranks = [tables[model][tuners].mean().to_numpy() for model in MODEL_LABELS]
     return JointRanks(tables, compute_kendall_tau(*mean_ranks), friedman, significant_pairs)

@@ -105,7 +105,7 @@ class EndStop(Force):
         """
         side = np.sign(c[0])
         depth = np.maximum(side * (moment.primary - c[1]), 0.0)
-        damping_factor = np.maximum(1.0 + c[2] * side * moment.v, 0.0)
+        damping_factor = np.maximum(1.0 + c[2] * side * moment.primary_rate, 0.0)
         return moment.along_primary(
             -c[0] * depth * np.sqrt(depth / _REFERENCE_PENETRATION) * damping_factor
         )  # (2)

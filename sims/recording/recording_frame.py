@@ -279,7 +279,7 @@ class _FrameTable(RecordingTable):
             )
         # A column of integers that once had missing cells has the type float.
         is_float = cells.dtype.kind == "f"
-        return [f"{cell:g}" if is_float else str(cell).strip() for cell in cells]
+        return [f"{cell:.15g}" if is_float else str(cell).strip() for cell in cells]
 
     def _get_values(self, name: str, frame: Any, column: str) -> Array:
         """Return a column as numbers (T,); NaN where a cell is missing.

@@ -683,6 +683,8 @@ def estimate_roughness(values: Array) -> float:
         return float("nan")
     windows = sliding_window_view(values, _NOISE_WINDOW_SAMPLES)
     windows = windows[np.isfinite(windows).all(axis=1)]
+    if not len(windows):
+        return float("nan")
     # At rest the same pixels give the same error again and again, which is no scatter.
     finite_values = values[np.isfinite(values)]
     travel = max(float(np.ptp(finite_values)), 1e-12)

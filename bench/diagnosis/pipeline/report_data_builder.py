@@ -164,7 +164,7 @@ def _estimate_parameters_by_group(
         consistency
         for consistency in assess_consistency(search, best)
         # Only the coefficient of the effect, and not the base parameters.
-        if consistency.number.startswith(name)
+        if consistency.number == name
     )
 
 

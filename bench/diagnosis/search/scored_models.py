@@ -509,6 +509,9 @@ class ScoredModelSet(ModelSet):
            floor is estimated for white noise, so AR(1) noise may exceed it (see
            `verdict_rules.exceeds_noise`).
         """
+        # A model that could not be simulated has no residual.
+        if not np.isfinite(model.fit.cost):
+            return False
         # Without a sigma (NaN), a channel counts as above the noise.
         residual_sigma = np.nan_to_num(model.likelihood.sigma, nan=np.inf)
         # 1. At the noise floor.

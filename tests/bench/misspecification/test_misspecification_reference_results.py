@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bench.misspecification import misspecification_scores
 from bench.misspecification.misspecification_scores import compute_joint_ranks
 from tests.benchmarks.domain_randomisation import halves
 from tests.benchmarks.misspecification_tables import FIT, lines
@@ -70,3 +71,14 @@ def test_learned_tuners_and_their_intervals_are_as_measured():
     half = halves(np.arange(1.0, 61.0)[::-1, None])
     assert half == [55.0], "the ceil(61 x 0.9)-th smallest of 60"
     assert halves(np.ones((5, 1))) == [np.inf], "five errors bound no 90 %"
+
+
+def test_a_pair_whose_p_value_is_zero_is_significant(monkeypatch):
+    p_values = pd.DataFrame([[1.0, 0.0, 0.2], [0.0, 1.0, 0.04], [0.2, 0.04, 1.0]])
+    monkeypatch.setattr(
+        misspecification_scores, "compute_nemenyi_p_values", lambda _: (0.01, p_values)
+    )
+    found = compute_joint_ranks(pd.read_csv(FOLDER / "ranks.csv"), "param_error")
+    tuner_count = found.ranked["plain"].shape[1]
+    assert tuner_count >= 3
+    assert found.distinct_tuner_pairs == {"plain": 2, "extended": 2}

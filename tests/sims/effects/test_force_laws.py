@@ -1,5 +1,7 @@
 """Tests of array functions of forces, frictions and contacts against numbers computed by hand."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -47,3 +49,16 @@ def test_contact_friction_is_its_coefficient():
     effect = effects.get_effect("contact.friction")()
     assert effect.friction(batch_coefficients(0.3, count=2)).tolist() == [[0.3], [0.3]]
     assert effect.friction(batch_coefficients(-0.3)).tolist() == [[0.0]]
+
+
+def test_an_end_stop_absorbs_the_speed_of_the_coordinate_that_hits_it():
+    """Eq. (2) of `sims.effects.state_limits` for the second of two coordinates."""
+    stiffness, place, loss, depth, rate = 200.0, 0.3, 0.5, 0.04, 0.7
+    now = SimpleNamespace(
+        primary=np.array([[place + depth]]), primary_rate=np.array([[rate]]),
+        v=np.array([[-3.0, rate]]), along_primary=lambda force: force,
+    )  # fmt: skip
+    stop = effects.get_effect("state.limit")()
+    force = stop.force(batch_coefficients(stiffness, place, loss), now)
+    expected = -stiffness * depth * np.sqrt(depth / 0.01) * (1.0 + loss * rate)
+    assert force == pytest.approx(np.array([[expected]]))

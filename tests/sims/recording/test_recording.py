@@ -2,11 +2,17 @@ import os
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from sims.core.simulator import Channel, Constant, InputError, Simulator
 from sims.recording.csv_table import read_csv_fast
-from sims.recording.recording import Run, read_recording, read_system_name
+from sims.recording.recording import (
+    Run,
+    make_frame_recording,
+    read_recording,
+    read_system_name,
+)
 from sims.recording.recording_writer import write_recording
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
@@ -466,3 +472,14 @@ def test_a_misspelt_column_is_answered_with_the_nearest_name(tmp_path):
 def test_extra_columns_that_cannot_be(tmp_path, toml, message):
     with pytest.raises(InputError, match=message):
         read_recording(written(tmp_path, toml=TOML + toml), Cart)
+
+
+def test_long_run_numbers_in_a_column_of_floats_stay_apart():
+    """A column of integers has the type float if a cell was missing once."""
+    frame = pd.DataFrame(
+        {"run": np.repeat([20240101.0, 20240102.0], 3), "t": [0.0, 0.5, 1.0] * 2,
+         "x": np.arange(6.0), "u": np.zeros(6)}
+    )  # fmt: skip
+    meta = {"system": "cart", "channels": {"x": {"unit": "m"}}, "inputs": {"u": {"unit": "N"}}}
+    recording = make_frame_recording(frame, Cart, meta, {})
+    assert [run.name for run in recording.runs] == ["20240101", "20240102"]

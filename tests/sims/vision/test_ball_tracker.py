@@ -223,3 +223,7 @@ def test_what_is_no_video_is_one_line(data, message, tmp_path):
     (tmp_path / "no.mp4").write_bytes(data)
     with pytest.raises(InputError, match=message):
         VideoFile(tmp_path / "no.mp4")
+
+
+def test_a_signal_without_samples_has_no_measurable_noise():
+    assert np.isnan(tracking.estimate_roughness(np.full(50, np.nan)))

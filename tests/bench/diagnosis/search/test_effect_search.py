@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import Likelihood
+from bench.diagnosis.fitting.fitted_models import FAILED_LIKELIHOOD
 from bench.diagnosis.search.effect_search import EffectSearch, is_hopeless
 from tests.bench.diagnosis.explained_samples import recording, searched
 from tests.bench.diagnosis.search.search_models import model, search_of
@@ -123,8 +124,16 @@ def test_the_residual_may_be_noise_up_to_the_floor_or_if_its_correlation_decays(
     made.evaluator = SimpleNamespace(observed=np.zeros((1, 1, 1)))
     made.noise = SimpleNamespace(sigma=np.array([2.0]))
     made.is_noise_stated = np.array([stated])
-    asked = SimpleNamespace(fit=None, likelihood=Likelihood(0.0, 2.0 * np.array([sigma]), None))
+    likelihood = Likelihood(0.0, 2.0 * np.array([sigma]), None)
+    asked = SimpleNamespace(fit=SimpleNamespace(cost=1.0), likelihood=likelihood)
     assert made.is_noise_like(asked) is quiet
+
+
+def test_a_model_that_could_not_be_simulated_leaves_no_noise(monkeypatch):
+    made = search(monkeypatch)
+    made.noise = SimpleNamespace(sigma=np.array([2.0]))
+    failed = SimpleNamespace(fit=SimpleNamespace(cost=np.inf), likelihood=FAILED_LIKELIHOOD)
+    assert made.is_noise_like(failed) is False
 
 
 def test_pieces_that_explain_nothing_leave_nothing_to_refit(monkeypatch):
