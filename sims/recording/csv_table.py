@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import islice, pairwise
+from itertools import islice, pairwise, takewhile
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -217,11 +217,15 @@ class RecordingTable:
         blocks: dict[str, list[Array]] = {name: [np.empty(0)] for name in self.numeric}
         while rows := list(islice(records, _ROWS_PER_CHUNK)):
             first_row = len(names)
+            # A log that was cut ends with an incomplete row, whose message would hide those of the
+            # rows before it, so these are converted first.
+            complete_rows = list(takewhile(lambda row: len(row) == len(header), rows))
+            if complete_rows:
+                cells = dict(zip(header, zip(*complete_rows, strict=True), strict=True))
+                for name, numbers in blocks.items():
+                    numbers.append(self._convert_to_numbers(name, cells[name], first_row))
+                names += [name.strip() for name in cells["run"]]
             self._check_row_widths(rows, len(header), first_row)
-            cells = dict(zip(header, zip(*rows, strict=True), strict=True))
-            for name, numbers in blocks.items():
-                numbers.append(self._convert_to_numbers(name, cells[name], first_row))
-            names += [name.strip() for name in cells["run"]]
         return names, {name: np.concatenate(numbers) for name, numbers in blocks.items()}
 
     def _iterate_records(self) -> Iterator[list[str]]:

@@ -132,6 +132,8 @@ def test_faulty_table_is_one_line_that_says_where(tmp_path, old, new, message):
             "row 7: expected 4 cells as in the header, found 6; correct",
         ),
         (CSV + "b,1,2\n", "row 7: expected 4 cells as in the header, found 3"),
+        # The message of a log that was cut does not hide that of a row before its end.
+        (CSV.replace("0.5,0.1,1", "0.5,abc,1") + "b,1,2\n", "row 3, column x: expected a finite"),
         (
             CSV.replace("x,u", "x,u,v").replace("\n1,", "\n1,0,"),
             "column 'v' is not declared; log.toml declares u, x; add it with its unit under "
