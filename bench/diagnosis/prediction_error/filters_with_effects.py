@@ -58,7 +58,7 @@ def compute_comparison_margin(gain: float) -> float:
     A filter is linear, so simulation decides between sets that are this close.
 
     Args:
-        gain: gain of the best set over the base model.
+        gain: gain of the best set over the base model, in twice the log-likelihood.
 
     Returns:
         The difference, like the gain, in twice the log-likelihood.
@@ -67,10 +67,11 @@ def compute_comparison_margin(gain: float) -> float:
 
 
 class FilteredSet(NamedTuple):
-    """A set of effects in the model of a filter.
+    """A set of effects in the model of a Kalman filter.
 
     Attributes:
-        followed: the runs, followed by this filter.
+        followed: the runs, followed by this filter: parameters of the model, innovations,
+            log-likelihood, and the forces that are still missing.
         names: names of the effects.
     """
 
@@ -137,13 +138,17 @@ class ModelFilters:
 
     @cached_property
     def _joints_missing_force(self) -> set[int]:
-        """Joints at which the filter of the base model shows clearly that a force is missing.
+        """Indices of the joints at which the base model clearly lacks a force.
 
-        The set is empty if not all joints are measured, if the base of the robot moves or stands on
-        the ground, or if servos reach their limits, where the linear model jumps.
+        There the filter of the base model is far less likely without process noise, which stands
+        for missing forces. The set is empty if not all joints are measured, if the base of the
+        robot moves or stands on the ground, or if servos reach their limits, where the linear model
+        jumps: the losses are then no reliable sign.
         """
         base, evaluator = self.base, self.evaluator
         joints = evaluator.simulator.system.coordinates
+        # A robot with a floating base has more forces than joints. `jumps` is the process noise
+        # that is added where a servo reaches its limit.
         if (
             base.force.size != len(joints)
             or not set(joints) <= set(evaluator.channels)
@@ -155,11 +160,11 @@ class ModelFilters:
         return set(np.flatnonzero(is_missing).tolist())
 
     def act_where_forces_are_missing(self, names: Iterable[str]) -> bool:
-        """Return whether effects act at all joints at which the base model misses a force.
+        """Return whether effects act at all joints at which the base model lacks a force.
 
-        If a force is missing at two joints, friction at one of them explains nothing alone. An
-        effect that does not change the force of a single joint only, such as a payload, is taken to
-        act at all joints.
+        Such joints are those where its filter clearly needs process noise. If a force is missing at
+        two joints, friction at one of them explains nothing alone. An effect that does not change
+        the force of a single joint only, such as a payload, is taken to act at all joints.
 
         Args:
             names: names of the effects.
@@ -188,6 +193,7 @@ class ModelFilters:
         key = model.fit.theta.tobytes()
         if key not in self._of_models:
             names = frozenset(model.effects)
+            # The newest filter with these effects, whatever their coefficients.
             same_effects = self._of_sets.get(names)
             followed = (same_effects or self.base).with_parameters(model.fit.theta)
             if same_effects is None:
@@ -250,7 +256,10 @@ class ModelFilters:
         Args:
             theta: (P,) initial parameters.
             names: names of the effects.
-            steps: maximum number of Gauss-Newton steps.
+            steps: maximum number of Gauss-Newton steps; 0 keeps the initial parameters.
+
+        Returns:
+            The effects with the filter of the improved parameters.
         """
         current = FilteredSet(self._follow_near(theta, self.base), tuple(names))
         return self.improve(current, steps)
@@ -280,6 +289,8 @@ class ModelFilters:
         """
         is_base = neighbour is self.base
         followed = self._follow_about_base(theta) if is_base else neighbour.with_parameters(theta)
+        # Smoothed states are deviations from the motion about which the model is linear; their
+        # first elements are the positions.
         deviations = np.abs(followed.smoothed.states[:, :, : followed.linear[0].positions])
         # This happens with an encoder offset: the true motion is far from the readings.
         is_far = deviations.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma))
@@ -288,10 +299,10 @@ class ModelFilters:
     def estimate_first_states(self, followed: FollowedRuns) -> Array:
         """Return states at the first samples (R, s) of the R runs, estimated from the readings.
 
-        They are the guesses of the evaluator. A position that is not known exactly is replaced by
-        the smoothed one of the filter where this differs by far more than noise, because an encoder
-        offset is then in the readings. The states of the base fit are not used, because they are
-        biased by the effects that it lacks.
+        They are the guesses of the evaluator, the positions before the velocities. A position that
+        is not known exactly is replaced by the smoothed one of the filter where this differs by far
+        more than noise, because an encoder offset is then in the readings. The states of the base
+        fit are not used, because they are biased by the effects that it lacks.
 
         Args:
             followed: the runs, followed by a filter.

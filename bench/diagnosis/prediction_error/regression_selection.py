@@ -204,6 +204,7 @@ class Regression:
                 break
             sizes = solution[negative] * np.sqrt(np.diagonal(gram)[negative])
             active[negative[np.argmin(sizes)]] = False
+            # The result if no coefficient remains active.
             solution[:] = 0.0
         explained_squares = float(solution @ cross)
         # rss = e'e - c'h, eq. (1), also holds for coefficients c some of which are fixed at zero.
@@ -240,7 +241,8 @@ class Regression:
 
         The columns of the set are projected out of the others first (Schur complement), so that all
         n groups are fitted at once without solving for the set again. Groups that are collinear
-        with the set, and those of effects that the set contains, gain nothing.
+        with the set, and those of effects that the set contains, gain nothing. K is the number of
+        all columns of the regression.
 
         Args:
             chosen: groups of the set; empty for gains over the model itself.
@@ -248,12 +250,14 @@ class Regression:
         columns = list_columns(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
         rss = self.solve(chosen).rss
-        # Products (c, K) of the c columns of the set, scaled to unit length, with all K columns.
+        # Products (c, K) of the c columns of the set and of `always`, scaled to unit length, with
+        # all K columns.
         rows = self.products.select_rows(columns)
         normal, scale = _normalise_gram(rows[:, columns])
         rows = rows / scale[:, None]
         # Coefficients of the set that explain each column and, in the last column, the innovations.
         solved = np.linalg.solve(normal, np.c_[rows, self._cross[columns] / scale])
+        # Sum of squares of each column, and product with the innovations, after the projection.
         squares = self._squares - np.einsum("ck,ck->k", rows, solved[:, :-1])
         cross = self._cross - rows.T @ solved[:, -1]
         # Almost nothing of a collinear column remains after the projection.
@@ -264,9 +268,10 @@ class Regression:
         # A batch has groups with the same number of columns.
         for batch, products in zip(self._batches, self._products_within_groups, strict=True):
             projected = np.einsum("cgi,cgj->gij", rows[:, batch.columns], solved[:, batch.columns])
-            kept = remains[batch.columns]
+            # Collinear columns get zero products, so that they explain nothing.
+            is_used = remains[batch.columns]
             explained, _ = compute_explained_squares(
-                np.where(kept[:, :, None] & kept[:, None, :], products - projected, 0.0),
+                np.where(is_used[:, :, None] & is_used[:, None, :], products - projected, 0.0),
                 cross[batch.columns][..., None],
                 batch.positive,
             )
@@ -392,8 +397,11 @@ class Regression:
         grams = self.products.select(columns)
         for run, total in enumerate(self.products.totals):
             coefficients = np.concatenate(self._fit_groups(groups, left_out=run).coefficients)
+            # Coefficients that the sign constraints do not fix at zero.
             used = coefficients != 0
             if is_shrunk and used.any():
+                # G is that of all runs. The innovations of the left-out run count as zero, so it is
+                # left out of h only.
                 normal, scale = _normalise_gram(grams[:, used][:, :, used].sum(axis=0))
                 cross = self.products.crosses[:, columns[used]].sum(axis=0)
                 cross = cross - self.products.crosses[run][columns[used]]
@@ -611,6 +619,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
     numerics = 0.0
     for _ in range(MAX_REGRESSIONS):
         regression = first or regress(refitted, [columns], selected_before, coefficients, numerics)
+        # The given regression is valid only before any effect is selected.
         first = None
         # Drop effects that are not needed any more, and add others.
         selected = regression.prune(selected_before) if selected_before else []
@@ -662,8 +671,10 @@ def regress(
         numerics: share of the integrator's step errors that is in the linear model.
         always: indices of probes that are part of every set, and are not candidates.
     """
-    # Shapes: R runs, T samples, C channels, K candidates; the arrays of a run have rows T C.
+    # R runs, T samples, C channels, K candidates and one column for the step errors. A column of a
+    # run has T C rows, one for each reading.
     run_count, samples, channels = followed.runs.residuals.shape
+    # K + 1
     count = sum(len(part.probes) for part in columns) + 1
     responses = np.empty((run_count, samples, channels, count), dtype=np.float32)
     first = 0
@@ -677,6 +688,7 @@ def regress(
     weights = np.zeros(count)
     weights[list_columns(chosen)] = np.concatenate([*coefficients, np.zeros(0)])
     weights[-1] = numerics
+    # Add what these columns explain to the innovations again.
     in_use = np.flatnonzero(weights)
     innovations = followed.filtered.whitened.reshape(run_count, -1)
     innovations = innovations + rows[:, :, in_use].astype(np.float64) @ weights[in_use]

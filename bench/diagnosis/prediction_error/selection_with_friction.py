@@ -47,8 +47,9 @@ MAX_RELINEARISATIONS = 3
 def select_with_friction(context: SearchContext, selected: Selected) -> FittedModel:
     """Select the other effects with dry friction of all joints in the filter's model.
 
-    Nothing is done if the selection has no friction of all joints: effects in addition to friction
-    at one joint are found faster one by one.
+    A set is a group of effects in the model of a Kalman filter (`FilteredSet`). It begins with dry
+    friction and grows by regressions. Nothing is done if the selection has no friction of all
+    joints: effects in addition to friction at one joint are found faster one by one.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -67,6 +68,7 @@ def select_with_friction(context: SearchContext, selected: Selected) -> FittedMo
         if larger is None:
             break
         current = larger
+    # No effect was added to the friction, and dry friction alone is fitted elsewhere.
     if len(current.names) == len(friction.effects):
         return context.search.base_model
     fitted = fit_filtered(context, current)
@@ -76,35 +78,46 @@ def select_with_friction(context: SearchContext, selected: Selected) -> FittedMo
 def _choose_start(context: SearchContext, friction: FitStart) -> FilteredSet:
     """Return dry friction with the first selected effects, or the standard joint model.
 
-    Motor inertia at all joints imitates a payload, so the joint model is not always better. The
-    set with the larger likelihood is returned, each minus the penalties of its effects.
+    The standard joint model has viscous friction and motor inertia (armature) in addition to dry
+    friction. Motor inertia at all joints imitates a payload, so this model is not always better.
+    Twice the log-likelihood of the filter, minus the penalties of all effects, decides.
 
     Args:
         context: search, filters and regressions of the recording.
         friction: dry friction of all joints.
+
+    Returns:
+        The better set, with its filter.
     """
     filters = context.filters
 
     def compute_criterion(current: FilteredSet) -> float:
+        """Return the penalised log-likelihood of a set; higher is better."""
         penalty = sum(filters.penalty(name) for name in current.names)
         return 2.0 * current.followed.log_likelihood - penalty
 
-    alone = filters.follow_with_effects(friction.theta, friction.effects)
-    selected = _add_selected(context, alone) or alone
+    friction_alone = filters.follow_with_effects(friction.theta, friction.effects)
+    # None if a regression adds nothing to the friction.
+    selected = _add_selected(context, friction_alone) or friction_alone
     return max(selected, _follow_joint_model(context, friction), key=compute_criterion)
 
 
 def _follow_joint_model(context: SearchContext, friction: FitStart) -> FilteredSet:
-    """Follow the runs with the standard joint model at all joints, as far as it is needed.
+    """Filter the runs with the standard joint model at all joints, as far as it is needed.
 
     A robot whose file has no friction mostly lacks viscous friction and the inertia of its motors,
-    too. These effects are added together, and those that gain less than their penalty are removed.
+    too. These effects are added together to the dry friction, and their coefficients are improved.
+    Those that gain less than their penalty (Wald statistic) are then removed.
 
     Args:
         context: search, filters and regressions of the recording.
         friction: dry friction of all joints.
+
+    Returns:
+        The set of the remaining effects, with its filter.
     """
     filters, evaluator = context.filters, context.evaluator
+    # Effects of the joint model other than the friction, for all joints (``@*``).
     others = [
         name
         for name in (f"{effect}@*" for effect in JOINT_MODEL)
@@ -129,33 +142,45 @@ def _follow_joint_model(context: SearchContext, friction: FitStart) -> FilteredS
 def _add_selected(context: SearchContext, current: FilteredSet) -> FilteredSet | None:
     """Add the effects that a regression about a set selects, and improve the coefficients.
 
-    The first effects of the selection are added, as many as make the filter likelier: the
-    regression is linear, so that it may select effects that imitate the nonlinear part of others.
+    The regression is linear, so that it may select effects that only imitate the nonlinear part of
+    others. A filter, which is not linear in its effects, therefore tests the first one, two, three,
+    ... selected effects in addition to the set. Each further effect must pass two tests:
+
+    1. With the coefficients from the regression, the filter is likelier than with one effect less,
+       also with coefficients from the regression. This needs no Gauss-Newton steps.
+    2. With improved coefficients, twice the log-likelihood gains at least the effect's penalty over
+       the best set so far.
+
+    The first effect that fails ends the trials.
 
     Args:
         context: search, filters and regressions of the recording.
-        current: the set.
+        current: the set of effects to which others are added, with its filter in `followed`.
 
     Returns:
-        The larger set; None if nothing is selected or the larger set is hardly likelier.
+        The largest set that passes, with improved coefficients; None if no effect passes.
     """
     filters = context.filters
     regression, _ = build_regression_about(current, [context.columns.library], current.followed)
-    best, first_log_likelihood = current, -np.inf
+    # Log-likelihood of the last set before its coefficients were improved.
+    best, last_unimproved = current, -np.inf
     chosen: list[DirectionGroup] = []
     for count in range(1, MAX_SET_SIZE + 1):
         chosen = regression.select(count, chosen)
-        # The effects of the set are candidates too, but are not added again.
+        # The selection is complete, or begins to select effects of the set again: these are
+        # candidates too, but cannot be added twice.
         if len(chosen) < count or any(group.effect in current.names for group in chosen):
             break
         start = _make_larger(context, current, chosen, regression)
         larger = filters.follow_with_effects(start.theta, start.effects, steps=0)
-        if larger.followed.log_likelihood <= first_log_likelihood:
+        # Test 1: `followed` are the runs, filtered with the coefficients from the regression.
+        if larger.followed.log_likelihood <= last_unimproved:
             break
-        first_log_likelihood = larger.followed.log_likelihood
+        last_unimproved = larger.followed.log_likelihood
         larger = filters.improve(larger)
-        price = sum(filters.penalty(name) for name in larger.names[len(best.names) :])
-        if 2.0 * (larger.followed.log_likelihood - best.followed.log_likelihood) < price:
+        # Test 2.
+        penalty = sum(filters.penalty(name) for name in larger.names[len(best.names) :])
+        if 2.0 * (larger.followed.log_likelihood - best.followed.log_likelihood) < penalty:
             break
         best = larger
     return None if best is current else best
@@ -167,13 +192,16 @@ def _make_larger(
     chosen: Sequence[DirectionGroup],
     regression: Regression,
 ) -> FitStart:
-    """Return a set with further effects, whose coefficients come from a regression.
+    """Return a model with the effects of a set and further ones from a regression.
+
+    The effects of the set keep their coefficients, unless a further effect contains and replaces
+    them. The coefficients of the further effects are solved for together by the regression.
 
     Args:
         context: search, filters and regressions of the recording.
-        current: the set.
-        chosen: groups of columns of the further effects.
-        regression: regression about the set, which gives their coefficients.
+        current: the set, with its filter.
+        chosen: the further effects, each with its columns of the regression.
+        regression: regression of the innovations of the set's filter.
     """
     start = FitStart(current.names, current.followed.theta, context.evaluator.initial_state_guesses)
     for group, solution in zip(chosen, regression.solve(chosen).coefficients, strict=True):
