@@ -120,6 +120,7 @@ def identify_base(
         return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
 
     base_indices = evaluator.base_indices.tolist()
+    # The widest bounds of each base parameter.
     limits = {i: compute_range_around(evaluator, i) for i in base_indices}
     # A fit must exceed the nominal parameters by MIN_GAIN.
     best, best_log_likelihood = followed, followed.log_likelihood + MIN_GAIN
@@ -145,6 +146,7 @@ def identify_base(
         log_likelihood = fitted.log_likelihood - start.penalty
         if not fitted.has_expected_innovations or is_at_bound:
             continue
+        # Without a missing force, further fits with effects are not needed.
         is_complete = not fitted.has_missing_force
         if log_likelihood > best_log_likelihood:
             best, best_log_likelihood = fitted, log_likelihood
@@ -204,6 +206,7 @@ def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follo
     columns = compute_columns(followed, list_probes(evaluator, (), names))
     regression = regress(followed, [columns])
     gains = regression.compute_net_gains()
+    # Gain in log-likelihood of the best base parameters so far.
     best_gain = best.log_likelihood - followed.log_likelihood
     starts, tried = list[_Start](), set[str]()
     # An effect has one group of columns for each of its shapes: its best one comes first.
@@ -228,6 +231,7 @@ def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follo
         values = {i: float(fitted.theta[i]) for i in bounds}
         if any(value and bound_of(value, *bounds[i]) for i, value in values.items()):
             continue
+        # The price is in twice the log-likelihood.
         penalty = 0.5 * regression.price(group)
         starts.append(_Start(fitted, (group.effect,), penalty, is_cause=True))
     return max(starts, key=lambda one: one.followed.log_likelihood - one.penalty, default=None)

@@ -229,7 +229,8 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
 
     Returns:
         The fitted model with the highest penalised log-likelihood among those with as many effects
-        as `best`; `best` itself if it has no effects or series joints.
+        as `best`, or a simpler one that is as good; `best` itself if it has no effects or series
+        joints.
     """
     compared = set[frozenset[str]]()
     while frozenset(best.effects) not in compared:
@@ -311,6 +312,8 @@ def _replace_two_effects(context: SearchContext, best: FittedModel) -> FittedMod
         best: the best model.
     """
     evaluator = context.evaluator
+    # Models that differ from the best one in one effect: by the effect that they add, and then by
+    # the effect of the best model that it replaces.
     replaced = dict[str, dict[str, FittedModel]]()
     for model in _list_models_near_the_best(context, len(best.effects)):
         if differ_in_one_effect(best, model):
@@ -321,6 +324,7 @@ def _replace_two_effects(context: SearchContext, best: FittedModel) -> FittedMod
     for name, models in replaced.items():
         if len(models) < 2:
             continue
+        # The effect can replace at least two effects, so it is tried in place of two of them.
         likeliest = select_likeliest(*models.values())
         coefficients = likeliest.fit.theta[evaluator.coefficient_slices[name]]
         starts.append(make_replacing_start(evaluator, best, list(models)[:2], name, coefficients))
@@ -467,7 +471,9 @@ def _confirm_by_simulation(
         ((cost, lowest),) = select_lowest_of_each(context, starts)
         if cost < limit:
             return lowest
+        # Index of the best factor; the starts repeat all factors for each choice of first states.
         number = next(i for i, scaled in enumerate(starts) if scaled is lowest) % factors.size
+        # The ends of the new range were simulated already, so they are left out.
         first, last = factors[max(number - 1, 0)], factors[min(number + 1, factors.size - 1)]
         factors = np.geomspace(first, last, factors.size + 2)[1:-1]
     return None

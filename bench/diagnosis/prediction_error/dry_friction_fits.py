@@ -103,6 +103,7 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
     # Another effect at the joint that promises more is fitted first.
     if not gain > max(context.proposals.compute_largest_gain_of_others(soft_start.effects[0]), 0.0):
         return None
+    # Stiff friction at this joint alone, unless it was simulated above.
     if soft_start.effects != friction.effects:
         stiff_friction = context.search.fit_one(soft_start, FIRST_ITERATIONS)
         if is_explained(context, stiff_friction):
@@ -148,6 +149,7 @@ def check_simulated_soft_friction(context: SearchContext) -> None:
     for joint in range(len(evaluator.simulator.system.coordinates)):
         name = f"friction.coulomb@{get_joint_name(evaluator, joint)}"
         if name in evaluator.library and filters.act_where_forces_are_missing([name]):
+            # More or less friction than in the model file.
             thetas = [
                 theta
                 for sign in (1.0, -1.0)
@@ -173,6 +175,9 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
 
     The joint is that of the Coulomb friction with the largest gain, and the sign of its coefficient
     tells whether there is more or less friction than in the model file.
+
+    Args:
+        context: search, filters and regressions of the recording.
 
     Returns:
         The model; None if the gain of dry friction by regression is far below the largest gain, or
@@ -220,11 +225,14 @@ def _is_far_less_likely(context: SearchContext, selected: Selected, log_likeliho
 
 
 def check_filter(context: SearchContext, log_likelihood: float) -> None:
-    """Raise `SoftFrictionError` if soft dry friction is likelier than a model with its filter.
+    """Raise `SoftFrictionError` if soft dry friction of one joint is likelier than a model.
+
+    Both are compared by the log-likelihoods of their filters. Soft friction is a compliant
+    constraint of MuJoCo, with which joints creep instead of sticking.
 
     Args:
         context: search, filters and regressions of the recording.
-        log_likelihood: log-likelihood of the filter.
+        log_likelihood: log-likelihood of the model's filter.
 
     Raises:
         SoftFrictionError: soft friction is likelier.
@@ -285,6 +293,10 @@ def _compute_margin(context: SearchContext, model: FittedModel) -> float:
 
     A model that leaves more than noise changes its likelihood a lot with any law, so the soft form
     must then gain a share of what the model gains over the base model.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        model: the fitted model, with stiff friction.
     """
     margin = INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
     if is_nearly_explained(context, model):
@@ -374,6 +386,7 @@ def is_friction_sufficient(
         context.evaluator, start.effects, start.theta
     )
     stiff_log_likelihood = filters.log_likelihood(stateless_theta)
+    # Minus infinity if the search has the soft form already, or if nothing was replaced.
     soft_log_likelihood = selected_log_likelihood = -np.inf
     if not filters.is_soft:
         soft_log_likelihood = filters.log_likelihood(stateless_theta, is_soft=True)

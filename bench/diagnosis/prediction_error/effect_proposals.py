@@ -132,6 +132,7 @@ class EffectProposals:
         Returns:
             Starts of fits, each with the effects of the set and one more, with a first coefficient.
         """
+        # The number of candidates shows whether some were added to the library.
         evaluator, count = self.filters.evaluator, len(self.columns.library.probes)
         proposed = None if current.names else self._for_base.get(count)
         if proposed is None:
@@ -188,6 +189,7 @@ class EffectProposals:
         only_simulated = dict(ranked[MAX_REGRESSION_PROPOSALS:]) | similar_shifts
         only_simulated |= self._propose_masses(regression)
         excluded = {*current.names, *by_regression}
+        # The joint where the filter most needs process noise, which stands for a missing force.
         joint = current.followed.joints_by_loss[0]
         return ProposedEffects(
             by_regression,
@@ -314,11 +316,13 @@ class EffectProposals:
         """
         evaluator, place = self.filters.evaluator, get_joint_name(self.filters.evaluator, joint)
         assert isinstance(evaluator.simulator, RobotSimulator)
+        # Largest speed of the joint in all runs.
         speed = max(
             float(np.abs(linear_run.trajectory.v[:, joint]).max()) for linear_run in followed.linear
         )
         interval = float(np.median(np.diff(evaluator.runs[0].times)))
-        # Sizes to try if the data give none; for other effects, a share with the sign of the step.
+        # Sizes to try if the data give none, in the unit of each coefficient; for other effects, a
+        # share with the sign of the step. The drag is a share of the typical force at full speed.
         typical = {
             **dict.fromkeys(COMMAND_MODEL, FIRST_LAG_INTERVALS * interval),
             f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
@@ -339,7 +343,14 @@ class EffectProposals:
         return {name: changes[name] for name in sorted(gains, key=lambda name: -gains[name])}
 
     def _compute_first_change(self, followed: FollowedRuns, name: str) -> tuple[float, float]:
-        """Return the first Gauss-Newton change of an effect alone, and its gain."""
+        """Return the first Gauss-Newton change of an effect alone, and its gain in log-likelihood.
+
+        The change is that of the effect's first coefficient, in its unit.
+
+        Args:
+            followed: the runs, followed by the filter of the set that is extended.
+            name: name of the effect.
+        """
         step, gain = self._compute_likelihood_step(followed, name)
         return float(step[self.filters.evaluator.get_coefficient_indices(name)[0]]), gain
 
@@ -362,6 +373,7 @@ class EffectProposals:
         servo_damping = get_servo_damping(self.filters.evaluator, joint)
         if servo_damping is None:
             return change, gain
+        # Damping of the joint per unit of the servo's coefficient.
         name, damping = servo_damping
         servo_change, servo_gain = self._compute_first_change(followed, name)
         if servo_gain < gain + self.filters.penalty(name):

@@ -127,7 +127,8 @@ def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
 
     Args:
         evaluator: the runs.
-        name: name of the effect; at a body, the joints are those that carry it.
+        name: name of the effect; at a body, the joints are those that move this body against its
+            parent.
     """
     joints = _list_joints(evaluator, name)
     if evaluator.available_effects[name].at == "body":
@@ -236,6 +237,7 @@ def list_similar_inertias(
         moment = float(axis @ tensor @ axis)
         other, factor = (scale, 1.0 / moment) if name == armature else (armature, moment)
         similar.append((other, coefficients * factor))
+    # Clip the coefficients to the bounds of the effects that the evaluator has.
     known = [(other, c) for other, c in similar if other in evaluator.coefficient_slices]
     bounds = [np.array(compute_coefficient_bounds(evaluator, other)).T for other, _ in known]
     return [(other, np.clip(c, *ends)) for (other, c), ends in zip(known, bounds, strict=True)]

@@ -67,6 +67,9 @@ ALL_SERVOS_STEPS = 6
 def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
     """Add effects to a fitted model as long as each gains more than its penalty, and fit the set.
 
+    A filter with the effects in its model decides which are added; the final set is fitted by
+    simulation, and effects that gain too little there are removed.
+
     Args:
         context: search, filters and regressions of the recording.
         model: the fitted model.
@@ -138,6 +141,7 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
         current = filters.follow_with_effects(friction.theta, friction.effects)
     larger_sets = _list_larger_that_pay(context, current)
     if not larger_sets and friction is None:
+        # No effect pays, but soft dry friction may: raise an error if it does.
         check_filter(context, current.followed.log_likelihood)
         return base
     best = base if larger_sets else fit_filtered(context, current)
@@ -175,6 +179,7 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
     """
     # Number of the last effects in a row that replace no missing force.
     imitations = 0
+    # The set to begin with has at least one effect, which counts as the first step.
     for _ in range(MAX_STEPS - 1):
         is_force_missing = current.followed.missing_forces.any()
         larger = _list_larger_that_pay(context, current) if is_force_missing else []
@@ -264,7 +269,12 @@ def _compare_larger_sets(context: SearchContext, current: FilteredSet) -> list[F
 
 
 def _follow_each(context: SearchContext, starts: Sequence[FitStart]) -> list[FilteredSet]:
-    """Return the filters of models with the coefficients of the regression."""
+    """Return the filters of models with the coefficients of the regression, without improving them.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        starts: models with one more effect than a set.
+    """
     search_control, followed = context.evaluator.search_control, list[FilteredSet]()
     for start in starts:
         followed.append(context.filters.follow_with_effects(start.theta, start.effects, steps=0))
@@ -307,6 +317,9 @@ def _improve_likeliest(
 
 def _compute_remaining_share(current: FilteredSet, larger: FilteredSet) -> float:
     """Return the smallest share of a joint's missing force that remains with one more effect.
+
+    The missing force at a joint is the standard deviation of the process noise that the filter
+    needs there. An effect replaces it if little of it remains.
 
     Args:
         current: the set; the result is infinite if no force is missing with it.

@@ -97,11 +97,11 @@ class IdentifiedSet:
 def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
     """Identify the effects and the base parameters of a long recording by prediction errors.
 
-    The textbook effects (Coulomb friction, drag, inertia of the bodies) are fitted in the filter's
-    model, and those that gain too little are removed. Then up to `MAX_ADDED` further effects are
-    added, each with the largest gain by regression, until the missing forces are negligible or no
-    effect gains enough. The result is simulated, but not fitted by simulation: an incomplete model
-    drifts away over a long run.
+    Prediction errors are the innovations of a Kalman filter. The textbook effects (Coulomb
+    friction, drag, inertia of the bodies) are fitted in the filter's model, and those that gain too
+    little are removed. Then up to `MAX_ADDED` further effects are added, each with the largest gain
+    by regression, until the missing forces are negligible or no effect gains enough. The result is
+    simulated, but not fitted by simulation: an incomplete model drifts away over a long run.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -133,6 +133,7 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
         # The new effect was removed at once.
         if larger.names[-1] not in current.names:
             break
+    # A set that lacks no force may be complete, and is then fitted by simulation.
     if not current.names or not current.followed.has_missing_force:
         return None
     states = context.filters.estimate_first_states(current.followed)
@@ -285,7 +286,7 @@ def _add_next_effect(
     regression, _ = build_regression_about(current, [columns], current.followed)
     gains = regression.compute_net_gains()
     for i, group in enumerate(regression.groups):
-        # Effects of the set cannot be added again.
+        # Effects of the set cannot be added again: their gain counts as zero.
         gains[i] *= group.effect not in current.names
     best = regression.groups[int(np.argmax(gains))]
     if not gains.max() > 0.0 or not regression.generalises([], [best]):

@@ -389,6 +389,7 @@ class _Intervals:
         inactive_share = np.concatenate(masks).mean()
         active_count = sum(int(mask.sum()) for mask in active_masks)
         interior_count = sum(int(mask.sum()) for mask in interior_masks)
+        # Of the shortest interval, only half is left without the samples near its ends.
         if (
             inactive_share > MAX_INACTIVE_SHARE
             or min(active_count, interior_count) < MIN_SAMPLES // 2
@@ -398,7 +399,8 @@ class _Intervals:
         hypothesis_error_outside = self._compute_residual_magnitudes(self.state, active_masks)
         drive_error_inside = self._compute_residual_magnitudes(ON, interior_masks)
         hypothesis_error_inside = self._compute_residual_magnitudes(self.state, interior_masks)
-        # A wrong damping has large errors wherever the joint is fast, not in one interval alone.
+        # A wrong damping has large errors wherever the joint is fast, not in one interval alone. So
+        # windows elsewhere are compared, with the median length of the intervals.
         length = int(np.median([end - first for mask in masks for first, end in spans(mask)]))
         drive_error_in_windows = self._compute_largest_errors(active_masks, length)
         # One joint is enough: another one may press against a stop and not move, either.
@@ -491,6 +493,9 @@ class _Intervals:
         Args:
             masks: (T,) samples of each run in which the drive is active.
             length: length of the windows in samples; they overlap by half.
+
+        Returns:
+            The largest error at each joint, in N or N·m; zero if no window is fully active.
         """
         largest = [0.0] * len(self._joints)
         for run, mask in enumerate(masks):
@@ -507,6 +512,8 @@ class _Intervals:
         self, run: int, mask: Mask, ends: tuple[int, int], typical_speeds: Sequence[float]
     ) -> bool:
         """Return whether all joints are at rest in an interval at an end of the run.
+
+        The hypothesis that all joints are held counts only at the beginning or the end of a run.
 
         Args:
             run: index of the run.

@@ -47,6 +47,7 @@ def list_moved_payloads(
     begin = evaluator.initial_state_guesses[:, :coordinates].mean(axis=0)
     data.qpos[simulator.addresses.positions] = begin
     mujoco.mj_kinematics(model, data)
+    # Frames of bodies have origin `xpos` and rotation `xmat`; `body_ipos` is the centre of mass.
     body = bodies[place]
     mass, position = coefficients[:1], coefficients[1:]
     # The point mass in the frame of the world.

@@ -97,11 +97,13 @@ class OutputErrorScores:
         """Return starts with one effect each, the one with the smallest residual first.
 
         The effects that gain most by regression are simulated with their coefficients from it,
-        because a response is linear only for small coefficients.
+        because a response is linear only for small coefficients. Effects whose gain does not exceed
+        their minimum gain (`price`) are left out.
         """
         regression, starts = self.regression, dict[str, FitStart]()
         net_gains = regression.compute_net_gains()
         for i in np.argsort(-net_gains, kind="stable").tolist():
+            # One shape of an effect; the best shape of each effect comes first.
             group = regression.groups[i]
             if net_gains[i] <= 0.0 or len(starts) == MAX_SIMULATED:
                 break
@@ -162,13 +164,17 @@ class OutputErrorScores:
         )
 
     def _simulate_geometry(self, probe: CandidateDirection) -> Array:
-        """Return the response (R, T, C) to another geometry, per unit of the coefficient.
+        """Return the response of the readings to another geometry, per unit of the coefficient.
 
         It is a central difference of simulations, each from first states whose contacts are in
         equilibrium for its geometry. A reading that diverges has no response.
 
         Args:
             probe: candidate whose coefficient changes.
+
+        Returns:
+            Derivatives (R, T, C) for T samples of C channels in R pieces, in the unit of each
+            channel per unit of the coefficient.
         """
         evaluator, theta = self.context.evaluator, self.context.filters.base.theta
         index = evaluator.get_coefficient_indices(probe.effect)[probe.coefficient_index]

@@ -158,8 +158,8 @@ class PredictionErrorSearch(EffectSearch):
     def run(self) -> FittedModel:
         """Return the model of all effects that the data show.
 
-        - If a likely model is known from before, it is fitted, and returned if it explains the
-          runs.
+        - If a likely model is known from before, it is fitted by simulation, and returned if it
+          explains the runs, which means that it leaves little more than noise.
         - Otherwise, a long recording whose model stays incomplete is identified by filters without
           simulation.
         - If neither gives a result, effects are searched.
@@ -170,6 +170,7 @@ class PredictionErrorSearch(EffectSearch):
             SoftFrictionError: dry friction of the data has MuJoCo's soft form.
         """
         context, self.best_supported_model, best = self._search_context, self.base_model, None
+        # A model of an earlier search, or the effects identified together with base parameters.
         likely = self.likely or self._make_identified_start()
         if likely is not None:
             best = remove_idle_effects(context, fit_by_simulation(context, likely))
@@ -353,8 +354,11 @@ class PredictionErrorSearch(EffectSearch):
     def _should_continue(self, best: FittedModel) -> bool:
         """Return whether to search effects that regression missed.
 
-        This is the case if a force is missing, the best model does not explain the runs, and there
-        is time left.
+        This is the case if the base model lacks a force (its filter needs process noise), the best
+        model does not explain the runs, and there is time left.
+
+        Args:
+            best: the best model so far.
         """
         is_force_missing = self._search_context.filters.base.has_missing_force
         return (
@@ -481,6 +485,7 @@ class PredictionErrorSearch(EffectSearch):
         It is the answer of a search that must end early. The base model is returned if the p-value
         of the gain, corrected for the number of effects in the library, exceeds the threshold.
         """
+        # Likelihoods have values in twice the log-likelihood.
         base, library_size = self.base_model, len(self.evaluator.library)
         best = select_likeliest(*self.models.values())
         indices = [i for name in best.effects for i in self.evaluator.get_coefficient_indices(name)]
@@ -614,10 +619,10 @@ class PredictionErrorSearch(EffectSearch):
     def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:
         """Return the p-value of the best additional force, and the signal it depends on.
 
-        The candidates are forces that are any piecewise linear function of one signal ("hats"),
-        such as a position or the time. A significant one shows a force that no effect of the
-        library describes. The signal is empty without candidates. The result is None for a model
-        with joints in series, which the filter does not follow.
+        The candidates are forces that are any piecewise linear function of one signal, such as a
+        position or the time: sums of triangular functions ("hats"). A significant one shows a force
+        that no effect of the library describes. The signal is empty without candidates. The result
+        is None for a model with joints in series, which the filter does not follow.
 
         Args:
             model: the fitted model.
@@ -630,7 +635,7 @@ class PredictionErrorSearch(EffectSearch):
         else:
             current = FilteredSet(filters.get_filter(model), model.effects)
             regression, _ = build_regression_about(current, [columns.hats], filters.base)
-        # Candidates are named by the signals they depend on.
+        # Hats are named by the signal they depend on; effects of the library are left out.
         labels = {probe.effect for probe in columns.hats.probes}
         scores = score_by_regression(regression, labels, self.make_rng("structure", model.effects))
         return scores.p_value, scores.effects[0] if scores.effects else ""

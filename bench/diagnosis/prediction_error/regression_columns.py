@@ -95,9 +95,14 @@ class LibraryColumns:
 
     @property
     def hats(self) -> Columns:
-        """Forces of any shape as candidates, by the labels of their families."""
+        """Forces of any shape as candidates: triangular functions ("hats") of one signal.
+
+        The hats of a family cover the range of one signal. The label of the family takes the place
+        of the effect's name.
+        """
         if self._hats is None:
             probes, _ = list_hat_probes(self.filters.evaluator)
+            # All hats are simulated by one effect; the labels of the families replace its name.
             named = [replace(probe, effect=JointHatForce.name) for probe in probes]
             self._hats = replace(compute_columns(self.filters.base, named), probes=tuple(probes))
         return self._hats
@@ -155,11 +160,13 @@ class LibraryColumns:
         return self.select()
 
     def start(self, groups: Sequence[DirectionGroup], coefficients: Sequence[Array]) -> FitStart:
-        """Return a start with a set of groups of columns.
+        """Return the start of a fit with effects at the coefficients of a regression.
+
+        All other parameters are those without any effect; first states are those of the base model.
 
         Args:
-            groups: groups of columns of the effects.
-            coefficients: coefficients of each group.
+            groups: columns of the regression for each effect.
+            coefficients: regression coefficients of these columns, for each group.
         """
         theta, base = self.filters.reference.copy(), self.filters.models.base_model
         for group, solution in zip(groups, coefficients, strict=True):
@@ -322,6 +329,9 @@ def build_regression_about(
         current: the runs, filtered with these effects.
         columns: inputs of the candidates, in one or more parts.
         followed: filtered runs about whose motion the effects are linearised.
+
+    Returns:
+        The regression, and the indices of the columns of each effect in the model, by name.
     """
     own_columns: dict[str, list[int]] = {}
     probes: list[CandidateDirection] = []

@@ -185,6 +185,7 @@ def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]
     searched_runs = np.linspace(0, all_runs.size - 1, min(SEARCHED_RUNS, all_runs.size))
     fitter = _ServoFitter(context, searched_runs.round().astype(np.intp))
     joint_model = model = fitter.fit_joint_model()
+    # Joints whose last law helped, so that another one may help.
     growing_joints = set(range(len(evaluator.channels)))
     for number in range(MAX_ROUNDS):
         if not growing_joints or evaluator.search_control.is_over():
@@ -304,6 +305,10 @@ class _ServoFitter:
         """Return the indices in theta of the parameters that are fitted to the position of a joint.
 
         They are stiffness and damping of its servo, and the coefficients of its laws.
+
+        Args:
+            joint: index of the joint.
+            laws: names of the effects at the joint.
         """
         indices = list(self._base_parameters[joint])
         for name in laws:
@@ -369,7 +374,15 @@ class _ServoFitter:
         return masked
 
     def _compute_change(self, other: ServoModel, model: ServoModel, joint: int) -> Array:
-        """Return by how much the position (R T,) of a joint differs, in units of the noise."""
+        """Return by how much the position (R T,) of a joint differs, in units of the noise.
+
+        It is zero where nothing was recorded or where a simulation failed.
+
+        Args:
+            other: the model whose positions are compared.
+            model: the model whose positions are subtracted.
+            joint: index of the joint.
+        """
         change = (other.simulated - model.simulated)[:, :, joint] / self._sigma[joint]
         masked: Array = np.where(self._mask[:, :, joint], np.nan_to_num(change), 0.0).ravel()
         return masked
@@ -413,6 +426,11 @@ class _ServoFitter:
         It is a share of the size of the parameter. Base parameters of the joint are relative
         changes of the gains of its servo, so their size is 1 + parameter. That of a coefficient is
         at least its range.
+
+        Args:
+            theta: (P,) parameters.
+            joint: index of the joint.
+            index: index of the parameter in theta.
         """
         low, high = self._evaluator.parameters[index].bounds
         is_relative = index in self._base_parameters[joint]
@@ -581,6 +599,7 @@ class _ServoFitter:
             The model in which those joints have these laws that are simulated better with them.
         """
         best_joint = int(np.argmin(model.costs / joint_model.costs))
+        # The laws of the best joint at all joints, in place of their own further laws.
         theta, laws = self._copy_laws(model, best_joint, joint_model)
         joints = [
             joint
@@ -638,6 +657,11 @@ class _ServoFitter:
 
         For each law that it has in addition, its squared residual must be lower by the share
         `MIN_GAIN`.
+
+        Args:
+            model: the model that may be better.
+            other: the model with which it is compared.
+            joint: index of the joint.
         """
         added = max(len(model.laws[joint]) - len(other.laws[joint]), 0)
         return bool(model.costs[joint] < (1.0 - MIN_GAIN) ** added * other.costs[joint])
@@ -651,8 +675,13 @@ class _ServoFitter:
         """Return whether a larger model reduces a joint's squared residual enough.
 
         It must do so even without the run that gains most, so that one odd run does not decide.
+
+        Args:
+            model: the smaller model.
+            larger: the model with one more law at the joint.
+            joint: index of the joint.
         """
-        # Squared residual of each run.
+        # Squared residual (R,) of each run.
         before, after = (
             np.square(self._compute_residual(one.simulated)[:, :, joint]).sum(axis=1)
             for one in (model, larger)

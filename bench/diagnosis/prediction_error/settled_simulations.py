@@ -146,10 +146,14 @@ class SettledSimulations:
         return self.fitter.settle(theta, self.states, True, self._known_jacobians)
 
     def project(self, values: Array) -> Array:
-        """Return values without what first states explain: P v of (1), (R, n, K).
+        """Return values without what first states explain, P v of (1).
 
         Args:
-            values: v (R, T, C, K), K changes of the readings in units of the noise.
+            values: v (R, T, C, K), K changes of the readings in units of the noise, for T samples
+                of C channels in R pieces.
+
+        Returns:
+            The projected values (R, n, K). The first T C of the n rows are the readings.
         """
         bases = self.fitter.factors.q
         runs, samples, channels, count = values.shape
@@ -227,7 +231,7 @@ def refine_with_wide_differences(
 def _compute_wide_quotient(
     fitter: FirstStateFitter, theta: Array, states: Array, index: int, bounds: Bounds, norm: float
 ) -> Array:
-    """Compute the difference quotient (2) by one coefficient, (R, T, C).
+    """Compute the difference quotient (2) of the readings by one coefficient.
 
     It is the change of the simulated readings between an increased and a decreased coefficient,
     with first states fitted anew on both sides, divided by the change of the coefficient. The width
@@ -240,9 +244,14 @@ def _compute_wide_quotient(
         index: index of the coefficient in theta.
         bounds: bounds of the coefficient; the difference ends at them.
         norm: norm of the derivative by small differences, in units of the noise, as a first guess.
+
+    Returns:
+        The quotient (R, T, C) for T samples of C channels in R pieces, in the unit of each channel
+        per unit of the coefficient.
     """
     low, high = bounds
-    # Half the change of the coefficient.
+    # Half the change of the coefficient, with which a response of this norm reaches the target; at
+    # most the whole range.
     half = float(TARGET_RESPONSE / max(norm, TARGET_RESPONSE / (high - low)))
     for _ in range(MAX_TRIED_DIFFERENCES):
         ends, simulated = [], []
@@ -252,6 +261,7 @@ def _compute_wide_quotient(
             ends.append(changed[index])
             simulated.append(fitter.simulate(changed, fitter.fit_settled_states(changed, states)))
         difference = simulated[0] - simulated[1]
+        # The smallest number avoids a division by zero if the bounds are equal.
         quotient: Array = difference / max(ends[0] - ends[1], np.finfo(float).tiny)
         response = 0.5 * np.sqrt(_sum_squares(fitter.scale_by_noise(difference)))
         if MIN_RESPONSE < response < MAX_RESPONSE or not np.isfinite(response):

@@ -104,7 +104,7 @@ def fit_by_simulation(
     is_incomplete = is_incomplete or not context.filters.act_where_forces_are_missing(start.effects)
     if is_incomplete and not is_nearly_explained(context, fitted):
         return fitted
-    # Replace the derivatives by first states in the evaluator, where fits find them.
+    # Replace the derivatives by first states in the evaluator, where all fits find them.
     derivatives_before = evaluator.state_derivatives
     start = fit_states_alone(context, fitted).make_start()
     compute_state_jacobian(evaluator, start.theta, start.initial_states, is_recomputed=True)
@@ -479,6 +479,7 @@ def drop_surplus_effects(
         theta = context.columns.start(groups, coefficients).theta
         gain = 2.0 * (filters.log_likelihood(theta) - base_log_likelihood)
         penalty = sum(filters.penalty(group.effect) for group in groups)
+        # For each effect after the best set so far, a share of the gain of that set.
         min_gain = MIN_FURTHER_GAIN_SHARE * max(best_gain, 0.0) * (count - kept_count)
         if gain - penalty > best_net_gain and gain - best_gain > min_gain:
             best_net_gain = gain - penalty

@@ -74,8 +74,12 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     it, at several factors of it. Effects at one joint are left out if a force is missing at another
     joint.
 
+    Args:
+        context: search, filters and regressions of the recording.
+
     Returns:
-        Costs and starts with one effect each, in ascending order of the cost.
+        Costs and starts with one effect each, in ascending order of the cost (sum of squared
+        residuals in units of the noise).
     """
     filters = context.filters
     states = filters.estimate_first_states(filters.base)
@@ -192,6 +196,9 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     likely missing are fitted in one batch, and the best of them to convergence. Effects at one
     joint are left out if a force is missing at another joint.
 
+    Args:
+        context: search, filters and regressions of the recording.
+
     Returns:
         The best model if it explains the runs, without an effect that gains too little; otherwise
         the base model.
@@ -202,6 +209,7 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
+    # The maximum number of proposals is that of these effects, so that none is left out.
     effects_at_joint = JOINT_MODEL + LINK_MODEL + SERVO_MODEL + SET_POINT_MODEL
     starts = context.proposals.list_alone(len(effects_at_joint))
     if not starts:
@@ -221,6 +229,7 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
         best = select_likeliest(best, refine_single_effects(context, fitted))
     if is_explained(context, best):
         return remove_idle_effects(context, best)
+    # Raise an error if dry friction of the other form is likelier.
     check_filter(context, filters.get_filter(best).log_likelihood)
     check_fit(context, best)
     return search.base_model
