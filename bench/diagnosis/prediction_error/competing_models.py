@@ -101,6 +101,10 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     Args:
         context: search, filters and regressions of the recording.
         best: the best model so far.
+
+    Returns:
+        The model with one effect; `best` if none is as good, or for a model with joints in series,
+        which filters do not follow.
     """
     search, filters = context.search, context.filters
     may_imitate = len(best.effects) > 1 and is_nearly_explained(context, best)
@@ -338,9 +342,9 @@ def _refine_at_force_limits(
 ) -> None:
     """Fit single effects of the joint and servo models further, if they may reach the best model.
 
-    Fits at force limits may stop in local minima. A fit that leaves much of the base model's excess
-    residual where the best model leaves only noise is not such a case. The results are stored in
-    `search.models`.
+    Fits at force limits may stop in local minima. A fit whose excess residual (RMS residual in
+    units of the noise, minus one) is far above that of the best model will hardly reach it, and is
+    not fitted further. The results are stored in `search.models`.
 
     Args:
         context: search, filters and regressions of the recording.

@@ -343,7 +343,8 @@ def _is_imitation(current: FilteredSet, larger: FilteredSet) -> bool:
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
     """Return whether a set lacks no force, and another one is far worse.
 
-    The coefficients of the other set then need not be improved.
+    A set lacks no force if its filter needs no process noise. The coefficients of the other set
+    then need not be improved.
 
     Args:
         context: search, filters and regressions of the recording.

@@ -111,6 +111,7 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
         if the set lacks no force, so that a simulation can be fitted.
     """
     evaluator, filters = context.evaluator, context.filters
+    # RMS residual of the base model in units of the noise, minus one.
     excess = context.search.compute_excess_residual(context.search.base_model)
     if not is_long(evaluator) or not excess > MIN_EXCESS or evaluator.search_control.is_over():
         return None

@@ -221,6 +221,7 @@ def _find_switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwit
     """
     for column in recording.runs[0].extra:
         for zero_is_off in (True, False):
+            # All actuators of the joint have the same samples, so the first one is tested.
             switches = [DriveSwitch(name, column, zero_is_off) for name in drive.actuators]
             if drive.is_likely([switches[0].off(run) for run in recording.runs]):
                 return switches

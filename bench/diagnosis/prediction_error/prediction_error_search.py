@@ -312,7 +312,8 @@ class PredictionErrorSearch(EffectSearch):
         """Identify the servos of a real arm, whose model is incomplete at most joints.
 
         This takes many simulations, so it is done only if neither the base model, one effect alone,
-        nor the selected effects come near the data. The result is used only if it adds effects at
+        nor the selected effects come near the data. The distance is the excess residual: the RMS
+        residual in units of the noise, minus one. The result is used only if it adds effects at
         most joints and leaves a smaller residual than the selection.
 
         Args:

@@ -539,6 +539,7 @@ def score_by_regression(
         peaks.append(((peak, peak_coefficients),))
     order = np.argsort(-score, kind="stable")
     quantiles = np.array(null_quantiles)
+    # Draws minus the quantile of each effect, so that effects with many shapes are comparable.
     null_excesses = np.array(null_draws).reshape(-1, NULL_DRAWS) - quantiles[:, None]
     p_value = min(len(scored_names) * min(p_values, default=1.0), 1.0)
     # Innovations are white: their autocorrelation phi is zero, and scores for white noise are the

@@ -372,7 +372,7 @@ def _list_series_coefficients(context: SearchContext, name: str) -> list[Array]:
     """Return the trial coefficients (k,) of an effect between a drive and its link.
 
     A fit from a much larger gap than the true one ends in a local minimum, so that shares of the
-    smallest trial coefficient are added to the probes.
+    smallest trial coefficient are added to the trial coefficients of the library (probes).
 
     Args:
         context: search, filters and regressions of the recording.
