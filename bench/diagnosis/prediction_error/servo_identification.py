@@ -569,9 +569,10 @@ class _ServoFitter:
                 laws[joint] = (*laws[joint], trial.name)
                 theta[self._evaluator.coefficient_slices[trial.name]] = trial.coefficients
             start = self.simulate(theta, laws)
+            adapted_theta = theta.copy()
             for joint, trial in chosen.items():
-                theta[self._list_parameters(joint, model.laws[joint])] = trial.parameters
-            adapted = self.simulate(theta, laws)
+                adapted_theta[self._list_parameters(joint, model.laws[joint])] = trial.parameters
+            adapted = self.simulate(adapted_theta, laws)
             better_joints = [joint for joint in chosen if adapted.costs[joint] < start.costs[joint]]
             start = self._join(start, dict.fromkeys(better_joints, adapted))
             fitted = self.fit(start, TRIAL_ITERATIONS, list(chosen))

@@ -8,8 +8,11 @@ import pytest
 
 from bench.diagnosis.explain import explain
 from bench.diagnosis.prediction_error.servo_identification import (
+    ServoModel,
     _estimate_gain,
+    _ServoFitter,
     _solve_damped,
+    _Trial,
     has_unknown_servos,
 )
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
@@ -104,6 +107,41 @@ def test_the_estimated_gain_is_that_of_least_squares():
     # A law that would need another sign, or is far too large, gains nothing.
     assert _estimate_gain(block, -change, residual) == 0.0
     assert _estimate_gain(block, 100.0 * change, residual) == 0.0
+
+
+def test_each_joint_starts_from_the_parameters_that_simulate_it_better(monkeypatch):
+    """The parameters estimated with a law help the first of two joints, and not the second."""
+    slices = {"friction.coulomb@a": slice(2, 3), "friction.coulomb@b": slice(3, 4)}
+    evaluator = SimpleNamespace(
+        coefficient_slices=slices, search_control=SimpleNamespace(is_over=lambda: False)
+    )
+    trials = {
+        joint: [_Trial(gain=0.5, name=name, coefficients=np.array([0.1]), parameters=estimated)]
+        for joint, (name, estimated) in enumerate(
+            zip(slices, (np.array([2.0]), np.array([3.0])), strict=True)
+        )
+    }
+    starts = []
+
+    def simulate(_, theta, laws):
+        """The stiffness of the first joint is 2, that of the second 1."""
+        return ServoModel(theta, tuple(laws), None, np.abs(theta[:2] - [2.0, 1.0]))
+
+    def fit(_, start, *_arguments):
+        starts.append(start.theta)
+        return start
+
+    def list_parameters(_, joint, laws):
+        return [joint, *(index for name in laws for index in range(4)[slices[name]])]
+
+    for name, value in {
+        "_evaluator": evaluator, "_estimate_gains": lambda *_: trials, "simulate": simulate,
+        "fit": fit, "_list_parameters": list_parameters, "_helps": lambda *_: False,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(_ServoFitter, name, value)
+    model = ServoModel(np.array([1.0, 1.0, 0.0, 0.0]), ((), ()), None, np.array([1.0, 0.0]))
+    assert _ServoFitter.__new__(_ServoFitter).add_laws(model, [0, 1]) is model
+    np.testing.assert_array_equal(starts, [[2.0, 1.0, 0.1, 0.1]])
 
 
 def test_a_step_without_damping_solves_the_least_squares_problem():
