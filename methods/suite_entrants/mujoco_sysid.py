@@ -32,8 +32,7 @@ class MuJoCoSysId(Tuner):
             sysid = importlib.import_module("mujoco.sysid")  # it has no types
             cube = sysid.ParameterDict()
             cube.add(sysid.Parameter("cube", task.start, np.zeros(task.dim), np.ones(task.dim)))
-            # The toolbox asks for groups of residuals, predictions and data at points in columns.
-            # There is one group; predictions and data are not used.
+            # Points are in columns; one group of residuals, no predictions and no data are needed.
             compute_groups = lambda x, _: ([residuals(x.reshape(task.dim, -1).T).T], None, None)  # noqa: E731
             sysid.optimize(cube, compute_groups, verbose=False, output=io.StringIO())
             return "mujoco.sysid reached its tolerance"
