@@ -261,8 +261,9 @@ def get_servo_damping(evaluator: RunEvaluator, joint: int) -> tuple[str, float] 
         return None
     # The third bias parameter of MuJoCo's servo is minus its damping.
     actuator, model = simulator.robot.actuator(servo).id, simulator.robot.compiled
-    gear, damping = model.actuator_gear[actuator, 0], -model.actuator_biasprm[actuator, 2]
-    return name, float(gear**2 * damping)
+    gear, servo_damping = model.actuator_gear[actuator, 0], -model.actuator_biasprm[actuator, 2]
+    damping = float(gear**2 * servo_damping)
+    return (name, damping) if damping > 0.0 else None
 
 
 def list_similar_dampings(
