@@ -432,8 +432,17 @@ def _list_plugin_files(folder: Path) -> dict[str, Path]:
         for part in list_study_folders(folder)
         for file in read_configuration(part).plugins
     ]
-    existing_files = [file for file in dict.fromkeys(plugins) if file.is_file()]
-    return {f"{_PLUGIN_FOLDER}/{file.name}": file for file in existing_files}
+    files: dict[str, Path] = {}
+    for file in dict.fromkeys(plugins):
+        if not file.is_file():
+            continue
+        name, number = file.name, 1
+        # Plugins of different folders may have the same name.
+        while f"{_PLUGIN_FOLDER}/{name}" in files:
+            number += 1
+            name = f"{file.stem}-{number}{file.suffix}"
+        files[f"{_PLUGIN_FOLDER}/{name}"] = file
+    return files
 
 
 def _list_comparison_folders(folder: Path) -> Iterator[Path]:
@@ -458,8 +467,11 @@ def _format_compare_command(folder: Path, name: str) -> str:
     experiment = configurations[0].experiment
     if not experiment.suite or experiment.diagnosis:
         return f"simgap compare {name}/{CONFIGURATION_FILE}"
+    archived_paths = {file: path for path, file in _list_plugin_files(folder).items()}
     plugins = [
-        f"--plugin {name}/{_PLUGIN_FOLDER}/{Path(f).name}" for f in configurations[0].plugins
+        f"--plugin {name}/{archived_paths[Path(file)]}"
+        for file in configurations[0].plugins
+        if Path(file) in archived_paths
     ]
     tuners = ",".join(entry.label for entry in experiment.tuners)
     return " ".join(["simgap compare suite", *plugins, f"--tuners {tuners}"])

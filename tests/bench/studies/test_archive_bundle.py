@@ -6,6 +6,7 @@ import shutil
 import stat
 import struct
 import zipfile
+from types import SimpleNamespace
 
 import pytest
 import tomli_w
@@ -318,3 +319,20 @@ def test_links_and_hidden_files_are_left_out_and_said(place, tmp_path):
     found = json.loads(run_command(*command).out)
     assert found["left_out"] == [".token: hidden", "secret: a link"]
     assert not {"run/secret", "run/.token"} & set(content(tmp_path / "a.zip"))
+
+
+def test_plugins_of_the_same_name_are_archived_under_different_names(monkeypatch, tmp_path):
+    plugins = [tmp_path / folder / "mine.py" for folder in ("first", "second", "absent")]
+    for plugin in plugins[:2]:
+        plugin.parent.mkdir()
+        plugin.write_text(f"# {plugin.parent.name}")
+    experiment = SimpleNamespace(suite="1", diagnosis=None, tuners=[SimpleNamespace(label="mine")])
+    configuration = SimpleNamespace(plugins=[str(p) for p in plugins], experiment=experiment)
+    monkeypatch.setattr(archives, "list_study_folders", lambda _: [tmp_path])
+    monkeypatch.setattr(archives, "read_configuration", lambda _: configuration)
+    files = archives._list_plugin_files(tmp_path)
+    assert files == {"plugins/mine.py": plugins[0], "plugins/mine-2.py": plugins[1]}
+    assert archives._format_compare_command(tmp_path, "run") == (
+        "simgap compare suite --plugin run/plugins/mine.py --plugin run/plugins/mine-2.py "
+        "--tuners mine"
+    )
