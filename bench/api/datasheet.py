@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
-from bench.api.explain import with_all_cores
-from bench.api.recordings import Sources, list_sources
+from bench.api.explain import Sources, list_sources, with_all_cores
 from bench.core.options import with_options
 from bench.core.plugin_registries import simulators
 from bench.diagnosis import explain as explaining

@@ -5,19 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, cast
+from typing import Annotated, Any, TypeAlias
 
+from bench.api.explain import RecordingSource, list_sources
 from bench.core.options import takes_options
 from bench.logs.importing.import_result import ImportOptions, ImportResult
 from bench.logs.importing.log_import import describe_logs, write_checked_description
-from bench.logs.recording_loading import (
-    FrameDescription,
-    Units,
-    load_recording,
-    read_frame_recording,
-)
+from bench.logs.recording_loading import FrameDescription, Units, load_recording
 from bench.logs.synthetic_recording import (
-    SimulatedRecording,
     SimulationSpec,
     simulate_recording,
 )
@@ -25,22 +20,8 @@ from sims.core.argument_checks import Expected, Name, check_arguments
 from sims.core.files import check_absent
 from sims.core.simulator import InputError
 from sims.recording.recording import Recording
-from sims.recording.recording_frame import Frame
 from sims.robot.parsing.read_model_file import read_robot
 
-_EXPECTED_RECORDING = (
-    "the path of NAME.csv, a Recording (of read_recording), a SimulatedRecording (of simulate) or "
-    "a pandas DataFrame"
-)
-RecordingSource: TypeAlias = Annotated[
-    str | Path | Recording | SimulatedRecording | Frame, Expected(_EXPECTED_RECORDING)
-]
-"""A source of one recording."""
-Sources: TypeAlias = Annotated[
-    RecordingSource | Sequence[RecordingSource],
-    Expected(f"{_EXPECTED_RECORDING}, or a list of these"),
-]
-"""A source of one recording, or several."""
 Logs: TypeAlias = Annotated[
     str | Path | Sequence[str | Path], Expected("the path of a log, or a list of paths")
 ]
@@ -98,41 +79,6 @@ def read_recording(
     )
     (source,) = list_sources(path, frame_description)
     return load_recording(source, system, model)[0]
-
-
-def list_sources(
-    recording: RecordingSource | Sequence[RecordingSource],
-    frame_description: FrameDescription | None = None,
-) -> list[str | Path | Recording]:
-    """Return recordings as a list of paths and of recordings in memory.
-
-    Args:
-        recording: One recording, or several.
-        frame_description: Description of data frames among them.
-
-    Raises:
-        InputError: No recording is given, a data frame is malformed, or `frame_description`
-            describes recordings that are not data frames.
-    """
-    frame_description = frame_description or FrameDescription()
-    is_single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
-    given_sources: list[Any] = (
-        [recording] if is_single else [*cast(Sequence[RecordingSource], recording)]
-    )
-    if not given_sources:
-        raise InputError(f"recording: expected {_EXPECTED_RECORDING}, found an empty list")
-    frames = [source for source in given_sources if isinstance(source, Frame)]
-    sources: list[str | Path | Recording] = []
-    for source in given_sources:
-        if isinstance(source, Frame):
-            number = f" {len(sources) + 1}" if len(given_sources) > 1 else ""
-            sources.append(read_frame_recording(source, frame_description, f"DataFrame{number}"))
-        else:
-            # Files have their own descriptions, so one that is given needs a data frame.
-            if not frames:
-                frame_description.refuse_for_files(source)
-            sources.append(source.recording if isinstance(source, SimulatedRecording) else source)
-    return sources
 
 
 @takes_options(ImportRequest)

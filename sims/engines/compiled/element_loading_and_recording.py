@@ -199,15 +199,3 @@ def shift_time(block: Block, i: int, seconds: float) -> float:
     block.a[T, i] += seconds
     block.a[REMAINING_TIME, i] = nan_maximum(block.a[REMAINING_TIME, i] - seconds, 0.0)
     return seconds
-
-
-def is_newly_loaded(block: Block, i: int) -> bool:
-    """Return whether a slot holds an element at the beginning of its run.
-
-    Args:
-        block: buffers of the elements that are integrated together.
-        i: index of the slot.
-    """
-    n = block.n
-    # An order index of -1 marks a slot that is not used.
-    return bool(n[ORDER_INDEX, i] >= 0 and n[STEP_INDEX, i] == 0 and n[IS_STEP_START, i] == 1)

@@ -24,17 +24,20 @@ from sims.engines.compiled.data_layout import (
     IN_MU,
     IN_SPEED,
     IS_RESTING,
+    IS_STEP_START,
     K1,
     MIN_REMAINING_SHARE,
+    ORDER_INDEX,
     OUT_E,
     OUT_MU,
     RESTITUTION,
     SHORT_FLIGHT_COUNT,
+    STEP_INDEX,
     Block,
     V,
     X,
 )
-from sims.engines.compiled.element_loading_and_recording import is_newly_loaded, shift_time
+from sims.engines.compiled.element_loading_and_recording import shift_time
 from sims.engines.compiled.interpreter import nan_maximum, run_instructions
 from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, SHORT_FLIGHT_SECONDS
 
@@ -75,6 +78,18 @@ def resolve_initial_ground_contact(block: Block) -> None:
                 handle_impact(block, i, K1)
             elif a[height_row, i] <= floor and a[rate_row, i] == 0.0:
                 n[IS_RESTING, i] = 1
+
+
+def is_newly_loaded(block: Block, i: int) -> bool:
+    """Return whether a slot holds an element at the beginning of its run.
+
+    Args:
+        block: buffers of the elements that are integrated together.
+        i: index of the slot.
+    """
+    n = block.n
+    # An order index of -1 marks a slot that is not used.
+    return bool(n[ORDER_INDEX, i] >= 0 and n[STEP_INDEX, i] == 0 and n[IS_STEP_START, i] == 1)
 
 
 def handle_impact(block: Block, i: int, k: int) -> None:
