@@ -14,7 +14,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from bench.diagnosis.randomization_ranges import (
 from bench.pages.python_code import identifiers, literal, number, render_code
 from sims.extended_simulator import ExtendedSimulator
 
+RangesByEffect: TypeAlias = dict[str, dict[str, list[RandomizationRange]]]
+"""Ranges by effect, then by joint, body or actuator."""
 _TEMPLATE = Path(__file__).with_name("ranges_isaac_lab.py.jinja")
 FRICTION_NOTE = (
     "On PhysX this term draws static, dynamic and viscous friction of the joint from one range; "
@@ -92,7 +94,7 @@ def _build_terms(
         The terms, and the ranges without a term.
     """
     # Ranges by effect, then by the name of their joint, body or actuator.
-    by_effect: dict[str, dict[str, list[RandomizationRange]]] = {}
+    by_effect: RangesByEffect = {}
     for number_range in ranges.ranges:
         by_effect.setdefault(number_range.effect, {}).setdefault(number_range.name, []).append(
             number_range
@@ -117,7 +119,7 @@ def _build_terms(
 
 
 def _make_joint_terms(
-    by_effect: dict[str, dict[str, list[RandomizationRange]]],
+    by_effect: RangesByEffect,
     sentences: Mapping[RandomizationRange, str],
 ) -> Iterator[Term]:
     """Yield the terms that randomise dry friction and armature of each joint.
@@ -143,7 +145,7 @@ def _make_joint_terms(
 
 
 def _make_body_terms(
-    by_effect: dict[str, dict[str, list[RandomizationRange]]],
+    by_effect: RangesByEffect,
     sentences: Mapping[RandomizationRange, str],
 ) -> Iterator[Term]:
     """Yield the terms that randomise mass, centre of mass and inertia of each body.
@@ -185,7 +187,7 @@ def _make_body_terms(
 
 
 def _make_gain_terms(
-    by_effect: dict[str, dict[str, list[RandomizationRange]]],
+    by_effect: RangesByEffect,
     sentences: Mapping[RandomizationRange, str],
     robot: Any,
 ) -> Iterator[Term]:
@@ -273,7 +275,7 @@ def _convert_gain_to_joint(
 
 
 def _make_gravity_term(
-    by_effect: dict[str, dict[str, list[RandomizationRange]]],
+    by_effect: RangesByEffect,
     sentences: Mapping[RandomizationRange, str],
     robot: Any,
 ) -> Iterator[Term]:

@@ -16,6 +16,7 @@ from time import perf_counter
 from typing import Any
 
 from bench.benchmark.isolation.message_channel import (
+    MessageKind,
     ProtocolError,
     pack_arrays,
 )
@@ -243,15 +244,15 @@ def _diagnose_isolated(
     try:
         if trained_arrays:
             deadline = perf_counter() + START_TIMEOUT_SECONDS
-            child.send(b"L", *pack_arrays(trained_arrays), deadline=deadline)
+            child.send(MessageKind.WEIGHTS, *pack_arrays(trained_arrays), deadline=deadline)
             child.receive(deadline=deadline)  # the process confirms that it has the arrays
         started_at = perf_counter()
         deadline = started_at + limits.seconds
-        child.send(b"Q", json.dumps(request).encode(), deadline=deadline)
+        child.send(MessageKind.QUESTION, json.dumps(request).encode(), deadline=deadline)
         message = child.receive(_MAX_ANSWER_BYTES, deadline)
         seconds = perf_counter() - started_at
         try:
-            if message.kind != b"A":
+            if message.kind != MessageKind.ANSWER:
                 raise ProtocolError("it gave no answer")
             answer = _validate_answer(message.to_document(_MAX_ANSWER_BYTES), limits)
         except (ProtocolError, InputError, KeyError, TypeError, ValueError) as error:

@@ -22,6 +22,7 @@ from bench.benchmark.isolation.message_channel import (
     MAX_HARNESS_MESSAGE_BYTES,
     MAX_TEXT_BYTES,
     MessageChannel,
+    MessageKind,
     PeerClosedError,
     pack_arrays,
     unpack_arrays,
@@ -51,36 +52,35 @@ def serve_requests(
 ) -> None:
     """Answer requests of the harness until the channel is closed.
 
-    Requests have a kind of one letter: L brings trained arrays, Q a case, F a training. The answers
-    are R (ready), K (arrays received), A (answer), L (trained arrays) and D (the diagnoser failed,
-    with the traceback).
+    The requests are WEIGHTS (trained arrays), QUESTION (a case) and FIT (a training) of
+    `MessageKind`; the answers are READY, DONE (arrays received), ANSWER, WEIGHTS and FAILURE (with
+    the traceback).
 
     Args:
         channel: message channel to the harness.
         policy: access policy of this process, with its own writable folder.
         first_document: names of the active isolation layers, which the first message reports.
     """
-    channel.send_document(b"R", first_document)
+    channel.send_document(MessageKind.READY, first_document)
     trained_arrays: Mapping[str, Array] = {}
     with suppress(PeerClosedError):
         while True:
             message = channel.receive(MAX_HARNESS_MESSAGE_BYTES)
             try:
                 match message.kind:
-                    case b"L":
+                    case MessageKind.WEIGHTS:
                         trained_arrays = unpack_arrays(message.body)
-                        channel.send(b"K")
-                    case b"Q":
+                        channel.send(MessageKind.DONE)
+                    case MessageKind.QUESTION:
                         question = message.to_document(_MAX_DOCUMENT_BYTES)
-                        channel.send_document(
-                            b"A", diagnose_case(question, Path(policy.folder), trained_arrays)
-                        )
-                    case b"F":
+                        diagnosis = diagnose_case(question, Path(policy.folder), trained_arrays)
+                        channel.send_document(MessageKind.ANSWER, diagnosis)
+                    case MessageKind.FIT:
                         arrays, used_simulations = train_diagnoser(
                             message.to_document(_MAX_DOCUMENT_BYTES)
                         )
                         channel.send(
-                            b"L",
+                            MessageKind.WEIGHTS,
                             *pack_arrays(
                                 {**arrays, _USED_SIMULATIONS_KEY: np.array([used_simulations])}
                             ),
@@ -91,7 +91,7 @@ def serve_requests(
                 error_text = traceback.format_exc().encode("utf-8", "replace")
                 # BaseException includes SystemExit: the diagnoser caused it. Of a long traceback,
                 # only the end is sent: half of the limit for a text leaves room for its encoding.
-                channel.send(b"D", error_text[-MAX_TEXT_BYTES // 2 :])
+                channel.send(MessageKind.FAILURE, error_text[-MAX_TEXT_BYTES // 2 :])
 
 
 _USED_SIMULATIONS_KEY = "simulations"

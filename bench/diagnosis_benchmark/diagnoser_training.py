@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from bench.benchmark.isolation.message_channel import (
     MAX_STATE_BYTES,
+    MessageKind,
     ProtocolError,
     unpack_arrays,
 )
@@ -134,10 +135,10 @@ def train_isolated(
     child = start_diagnoser_process(code, memory=0, hidden=hidden)  # memory is not limited
     try:
         deadline = started_at + seconds
-        child.send(b"F", json.dumps(request).encode(), deadline=deadline)
+        child.send(MessageKind.FIT, json.dumps(request).encode(), deadline=deadline)
         message = child.receive(MAX_STATE_BYTES, deadline)
         try:
-            if message.kind != b"L":
+            if message.kind != MessageKind.WEIGHTS:
                 raise ProtocolError("it has no training result")
             trained_arrays = unpack_arrays(message.body)
             used_simulations = int(trained_arrays.pop("simulations")[0])

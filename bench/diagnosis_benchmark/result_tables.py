@@ -382,8 +382,9 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
         order: names of the diagnosers.
 
     Returns:
-        One row per metric and diagnoser: number of cases (``questions``), of those that only simgap
-        or only the other one answered correctly, and the p-value before and after the correction.
+        One row per metric and diagnoser: number of cases (``questions``), numbers of cases that
+        only simgap or only the other one answered correctly, and the p-value before and after the
+        correction.
     """
     columns = ["metric", "diagnoser", "questions", "only_simgap", "only_other", "p_value"]
     lines = []

@@ -225,7 +225,9 @@ class RecordingTable:
                 for name, numbers in blocks.items():
                     numbers.append(self._convert_to_numbers(name, cells[name], first_row))
                 names += [name.strip() for name in cells["run"]]
-            self._check_row_widths(rows, len(header), first_row)
+            if len(complete_rows) < len(rows):
+                incomplete_row = rows[len(complete_rows)]
+                raise self._make_row_width_error(incomplete_row, len(header), len(names))
         return names, {name: np.concatenate(numbers) for name, numbers in blocks.items()}
 
     def _iterate_records(self) -> Iterator[list[str]]:
@@ -306,24 +308,18 @@ class RecordingTable:
             f"{self.path}: expected column '{name}', found columns {_join_names(found)}{hint}"
         )
 
-    def _check_row_widths(self, rows: list[list[str]], width: int, first_row: int) -> None:
-        """Check that all rows have as many cells as the header.
+    def _make_row_width_error(self, row: Sequence[str], width: int, record: int) -> InputError:
+        """Make the error of a row that has another number of cells than the header.
 
         Args:
-            rows: Cells of each row.
+            row: Cells of the row.
             width: Number of cells of the header.
-            first_row: Number of the first of these rows, counted from 0 below the header.
-
-        Raises:
-            InputError: A row has another number of cells.
+            record: Number of the row, counted from 0 below the header.
         """
-        for record, row in enumerate(rows, start=first_row):
-            if len(row) != width:
-                raise InputError(
-                    f"{self.path}, row {self._find_line_number(record)}: "
-                    f"expected {width} cells as in the header, found {len(row)}; "
-                    "correct or delete the row"
-                )
+        return InputError(
+            f"{self.path}, row {self._find_line_number(record)}: "
+            f"expected {width} cells as in the header, found {len(row)}; correct or delete the row"
+        )
 
     def _convert_to_numbers(self, name: str, cells: Sequence[str], first_row: int) -> Array:
         """Convert the cells of a column to numbers (T,); empty ones to NaN where gaps are allowed.

@@ -63,7 +63,8 @@ class MessageKind:
     PROGRESS = b"W"  # process: losses of one epoch of the training
     FAILURE = b"D"  # process: code of the tuner has failed; the traceback
     WRITTEN_FILES = b"N"  # both: question for the files that the tuner wrote, and the answer
-    QUESTION = b"Q"  # harness: which plugin to describe
+    QUESTION = b"Q"  # harness: which plugin to describe, or which case to diagnose
+    ANSWER = b"A"  # process of a diagnoser: its diagnosis of the case
 
 
 EVALUATION_SIMULATOR_FLAG = 1

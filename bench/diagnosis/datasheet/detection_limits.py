@@ -191,14 +191,14 @@ def _compute_prediction_half_widths(
         consistencies: Consistency of each parameter between runs, and between logs if there are
             several.
     """
-    half_widths_by_grouping: dict[str, dict[str, float]] = {"run": {}, "log": {}}
-    for consistency in consistencies:
-        # Groups by a constant, such as a load, are not used.
-        if consistency.by in half_widths_by_grouping:
-            half_width = Z95 * consistency.prediction_sigma
-            half_widths_by_grouping[consistency.by][consistency.number] = half_width
-    # A new log is more general than a new run, so that it takes precedence.
-    return {**half_widths_by_grouping["run"], **half_widths_by_grouping["log"]}
+    # A new log is more general than a new run, so that it comes later and replaces it. Groups by a
+    # constant, such as a load, are not used.
+    return {
+        consistency.number: Z95 * consistency.prediction_sigma
+        for grouping in ("run", "log")
+        for consistency in consistencies
+        if consistency.by == grouping
+    }
 
 
 def _add_small_gaps(

@@ -740,7 +740,7 @@ def linearise_run(
         run: index of the run.
         trajectory: the motion; None to estimate or simulate it.
         neighbour: model of the same run at other parameters or about another motion, whose
-            matrices are reused; None if there is none.
+            matrices are reused; None to compute all matrices.
         simulator: robot with other contact or friction settings; None for that of the evaluator.
         reuses_jacobians: whether derivatives of steps are taken from the neighbour.
         reuses_loads: whether the forces that transmissions carry are taken from the neighbour.

@@ -400,7 +400,7 @@ def _find_competing_effects(
         is_promising = effect in same_joint and gain > MIN_SAME_JOINT_GAIN_SHARE * own_gain
         # A law that contains this one never replaces it.
         if (is_near or is_promising) and name not in evaluator.available_effects[effect].contains:
-            # A family hardly ever wins against an effect at one place, so it takes nobody's turn.
+            # Families are hardly ever likelier than an effect at one place, so they do not count.
             near_count += is_near and (name.endswith("@*") or not effect.endswith("@*"))
             coefficients = context.columns.solve_alone(remaining, group)
             competing_effects[effect] = _CompetingEffect(effect, coefficients, loss)

@@ -340,9 +340,9 @@ class TangentModel:
         """
         with self._points.with_batch(mujoco_batch):
             ends, readings = self._points.step_displaced({}, acting)
-        # A state begins with the positions and the velocities of the E joints.
-        joint_count = self._typical_forces.size
-        velocities = slice(joint_count, 2 * joint_count)
+        # A state begins with E displacements and E velocities, of joints and of floating bodies.
+        velocity_count = self._typical_forces.size
+        velocities = slice(velocity_count, 2 * velocity_count)
         base_ends, _ = self._base_step  # states after a step without the change
         difference = (ends - base_ends)[:, velocities] / change
         derivatives = self.quotients.forces[:, velocities]  # B, (N, E, E)
