@@ -24,11 +24,13 @@ from os.path import abspath, dirname, realpath
 
 _WHERE = {
     "bench": ("__version__",),
-    "bench.api.compare": ("ComparisonResult", "compare", "sweep"),
+    "bench.api.compare": ("compare", "sweep"),
+    "bench.api.comparison_result": ("ComparisonResult",),
     "bench.api.datasheet": ("datasheet",),
     "bench.api.design": ("NextRecording", "design"),
     "bench.api.explain": ("explain", "score"),
-    "bench.api.recordings": ("import_logs", "read_recording", "simulate"),
+    "bench.api.recordings": ("read_recording", "simulate"),
+    "bench.logs.importing.log_import": ("import_logs",),
     "bench.conformance": ("parametrize",),
     "bench.diagnosis.explanation": ("Explanation",),
     "bench.diagnosis.datasheet.datasheet": ("DataSheet",),
@@ -39,7 +41,7 @@ _WHERE = {
         "DiagnoserTrainingTask",
         "NamedCause",
     ),
-    "bench.benchmark.problem.experiment": ("Experiment",),
+    "bench.benchmark.problem.experiment_config": ("Experiment",),
     "bench.core.plugin_registries": (
         "diagnosers",
         "effects",

@@ -2,17 +2,19 @@
 from collections.abc import Sequence
 
 from bench import __version__
-from bench.api.compare import ComparisonResult, compare, sweep
+from bench.api.compare import compare, sweep
+from bench.api.comparison_result import ComparisonResult
 from bench.api.datasheet import datasheet
 from bench.api.design import NextRecording, design
 from bench.api.explain import explain, score
-from bench.api.recordings import import_logs, read_recording, simulate
-from bench.benchmark.problem.experiment import Experiment
+from bench.api.recordings import read_recording, simulate
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.conformance import parametrize
 from bench.core.diagnoser import Answer, Diagnoser, DiagnoserTrainingTask, DiagnosisCase, NamedCause
 from bench.core.plugin_registries import diagnosers, effects, load_plugins, simulators, tuners
 from bench.diagnosis.datasheet.datasheet import DataSheet
 from bench.diagnosis.explanation import Explanation
+from bench.logs.importing.log_import import import_logs
 from methods.tuner import (
     BudgetExceededError,
     Evaluation,

@@ -17,8 +17,8 @@ from typing import Any, Literal
 
 from sims import effects as library
 from sims.core import files
-from sims.core.document_fields import OPTIONAL
 from sims.core.effect import make_effect_parameters
+from sims.core.json_documents import OPTIONAL
 from sims.core.simulator import InputError, Parameter, Simulator
 from sims.core.toml_validation import (
     check_finite,
@@ -63,6 +63,9 @@ _ALLOWED_KEYS = (
 """Keys allowed in the file."""
 
 _NUMBER = "a finite number"
+
+EXTENDED_MODEL_FILE = "extended.toml"
+"""File of the extended simulator in the folder of an explanation."""
 
 
 @dataclass(frozen=True)

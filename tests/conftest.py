@@ -37,9 +37,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # background jobs ignore 
 def pytest_configure(config):
     """Compile the native kernel before pytest starts its workers, which would all wait for it."""
     if not hasattr(config, "workerinput"):
-        from sims.engines.compiled import kernel
+        from sims.engines.compiled import element_stepping
 
-        kernel.COMPILED.load()
+        element_stepping.COMPILED.load()
 
 
 def pytest_collection_finish():

@@ -1,6 +1,6 @@
 """Build a small experiment on the test simulator."""
 
-from bench.benchmark.problem.experiment import parse_experiment
+from bench.benchmark.problem.experiment_config import parse_experiment
 
 SPRING = {
     "simulator": "spring",

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-from bench.core.options import option
+from bench.core.option_dataclasses import option
 from methods.tuner import Tuner
 from sims.core.argument_checks import Count, Expected, Files, Name, Names, Natural, Seconds
 from sims.core.simulator import InputError, make_unknown_name_error
 
 if TYPE_CHECKING:
-    from bench.benchmark.problem.experiment import Experiment
+    from bench.benchmark.problem.experiment_config import Experiment
 
 Tuners: TypeAlias = Annotated[
     Sequence[Name | type[Tuner]],

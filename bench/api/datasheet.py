@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
-from bench.api.explain import Sources, list_sources, with_all_cores
-from bench.core.options import with_options
+from bench.api.explain import with_all_cores
+from bench.api.recordings import Sources, list_sources
+from bench.core.option_dataclasses import with_options
 from bench.core.plugin_registries import simulators
 from bench.diagnosis import explain as explaining
 from bench.diagnosis.datasheet.datasheet import DataSheet, build_datasheet
-from bench.diagnosis.datasheet.datasheet_subject import make_subject
+from bench.diagnosis.datasheet.datasheet_joint import make_subject
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.verdict import Verdict
@@ -102,7 +103,7 @@ def check_joint_exists(
 def _read_explanation_folder(folder: Path) -> tuple[ExtendedSimulator, Verdict]:
     """Read the results that explain has written to a folder."""
     # Imported here, because it imports pandas, which most data sheets do not need.
-    from bench.studies.explanation_verification import read_verdict
+    from bench.diagnosis.verdict import read_verdict
 
     verdict = read_verdict(folder)
     extended, kind, _ = open_extended(folder / "extended.toml", simulators.get)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.api.explain import Sources, list_sources, with_all_cores
-from bench.core.options import with_options
+from bench.api.explain import with_all_cores
+from bench.api.recordings import Sources, list_sources
+from bench.core.option_dataclasses import with_options
 from bench.diagnosis import explain as explaining
 from bench.diagnosis.experiment_design.information_gain import DISCRIMINATION_THRESHOLD
 from bench.diagnosis.experiment_design.next_run import NextRunDesign

@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar, cast
+from typing import Any, TypeVar
 
-from bench.core.options import with_options
+from bench.api.recordings import RecordingSource, Sources, list_sources
+from bench.core.option_dataclasses import with_options
 from bench.core.resource_estimates import count_available_cores
 from bench.diagnosis import explain as explaining
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.score_extended import MODEL_FILES, score_model
-from bench.logs.recording_loading import FrameDescription, Units, read_frame_recording
-from bench.logs.synthetic_recording import SimulatedRecording
 from sims import extended_simulator as extended_file
-from sims.core.argument_checks import Expected, check_arguments
-from sims.core.simulator import InputError
-from sims.recording.recording import Recording
-from sims.recording.recording_frame import Frame
+from sims.core.argument_checks import check_arguments
+from sims.recording.recording_frame import Frame, FrameDescription, Units
 
 SearchOptions = TypeVar("SearchOptions", bound=ExplainOptions)
-_EXPECTED_RECORDING = (
-    "the path of NAME.csv, a Recording (of read_recording), a SimulatedRecording (of simulate) or "
-    "a pandas DataFrame"
-)
-RecordingSource: TypeAlias = Annotated[
-    str | Path | Recording | SimulatedRecording | Frame, Expected(_EXPECTED_RECORDING)
-]
-"""A source of one recording."""
-Sources: TypeAlias = Annotated[
-    RecordingSource | Sequence[RecordingSource],
-    Expected(f"{_EXPECTED_RECORDING}, or a list of these"),
-]
-"""A source of one recording, or several."""
 
 
 @with_options(ExplainOptions)
@@ -61,41 +45,6 @@ def explain(recording: Sources, options: ExplainOptions) -> Explanation:
 def with_all_cores(options: SearchOptions) -> SearchOptions:
     """Replace the default number of worker processes by the number of cores."""
     return replace(options, jobs=options.jobs or count_available_cores())
-
-
-def list_sources(
-    recording: RecordingSource | Sequence[RecordingSource],
-    frame_description: FrameDescription | None = None,
-) -> list[str | Path | Recording]:
-    """Return recordings as a list of paths and of recordings in memory.
-
-    Args:
-        recording: One recording, or several.
-        frame_description: Description of data frames among them.
-
-    Raises:
-        InputError: No recording is given, a data frame is malformed, or `frame_description`
-            describes recordings that are not data frames.
-    """
-    frame_description = frame_description or FrameDescription()
-    is_single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
-    given_sources: list[Any] = (
-        [recording] if is_single else [*cast(Sequence[RecordingSource], recording)]
-    )
-    if not given_sources:
-        raise InputError(f"recording: expected {_EXPECTED_RECORDING}, found an empty list")
-    frames = [source for source in given_sources if isinstance(source, Frame)]
-    sources: list[str | Path | Recording] = []
-    for source in given_sources:
-        if isinstance(source, Frame):
-            number = f" {len(sources) + 1}" if len(given_sources) > 1 else ""
-            sources.append(read_frame_recording(source, frame_description, f"DataFrame{number}"))
-        else:
-            # Files have their own descriptions, so one that is given needs a data frame.
-            if not frames:
-                frame_description.refuse_for_files(source)
-            sources.append(source.recording if isinstance(source, SimulatedRecording) else source)
-    return sources
 
 
 @check_arguments

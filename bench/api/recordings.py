@@ -3,47 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, cast
 
-from bench.api.explain import RecordingSource, list_sources
-from bench.core.options import takes_options
-from bench.logs.importing.import_result import ImportOptions, ImportResult
-from bench.logs.importing.log_import import describe_logs, write_checked_description
-from bench.logs.recording_loading import FrameDescription, Units, load_recording
+from bench.core.option_dataclasses import takes_options
+from bench.logs.recording_loading import load_recording, read_frame_recording
 from bench.logs.synthetic_recording import (
+    SimulatedRecording,
     SimulationSpec,
     simulate_recording,
 )
 from sims.core.argument_checks import Expected, Name, check_arguments
-from sims.core.files import check_absent
 from sims.core.simulator import InputError
 from sims.recording.recording import Recording
-from sims.robot.parsing.read_model_file import read_robot
-
-Logs: TypeAlias = Annotated[
-    str | Path | Sequence[str | Path], Expected("the path of a log, or a list of paths")
-]
-"""Files of one run, or folders with the files of one run each."""
-
-
-@dataclass(frozen=True)
-class ImportRequest(ImportOptions):
-    """Logs to be described, with what the user states about them.
-
-    Attributes:
-        logs: Files of one run, or folders with the files of one run each.
-        model: Model file of the robot, MJCF or URDF.
-        out: Path NAME.toml of a new file.
-    """
-
-    logs: Logs
-    model: str | Path
-    out: str | Path
-
+from sims.recording.recording_frame import Frame, FrameDescription, Units
 
 simulate = takes_options(SimulationSpec, "simulate")(simulate_recording)
+
+_EXPECTED_RECORDING = (
+    "the path of NAME.csv, a Recording (of read_recording), a SimulatedRecording (of simulate) or "
+    "a pandas DataFrame"
+)
+
+RecordingSource: TypeAlias = Annotated[
+    str | Path | Recording | SimulatedRecording | Frame, Expected(_EXPECTED_RECORDING)
+]
+"""A source of one recording."""
+
+Sources: TypeAlias = Annotated[
+    RecordingSource | Sequence[RecordingSource],
+    Expected(f"{_EXPECTED_RECORDING}, or a list of these"),
+]
+"""A source of one recording, or several."""
 
 
 @check_arguments
@@ -81,27 +72,36 @@ def read_recording(
     return load_recording(source, system, model)[0]
 
 
-@takes_options(ImportRequest)
-def import_logs(options: ImportRequest) -> ImportResult:
-    """Write a description (TOML) of a robot's raw logs, so that all commands can read them.
+def list_sources(
+    recording: RecordingSource | Sequence[RecordingSource],
+    frame_description: FrameDescription | None = None,
+) -> list[str | Path | Recording]:
+    """Return recordings as a list of paths and of recordings in memory.
 
     Args:
-        options: Arguments, the attributes of `ImportRequest` and, by name, those of
-            `bench.logs.importing.import_result.ImportOptions`.
-
-    Returns:
-        The guesses, the columns that were left out, and what to check.
+        recording: One recording, or several.
+        frame_description: Description of data frames among them.
 
     Raises:
-        InputError: The logs cannot be read or contain nothing of the robot; the message is one
-            line, and nothing is written.
+        InputError: No recording is given, a data frame is malformed, or `frame_description`
+            describes recordings that are not data frames.
     """
-    logs = [options.logs] if isinstance(options.logs, str | Path) else options.logs
-    model, path = Path(options.model), Path(options.out)
-    if path.suffix != ".toml":
-        raise InputError(f"expected a description to write, NAME.toml, found '{path}'")
-    check_absent([path])
-    paths = [Path(log) for log in logs]
-    result = describe_logs(paths, read_robot(model), model, path.parent, options)
-    write_checked_description(path, result.text)
-    return result
+    frame_description = frame_description or FrameDescription()
+    is_single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
+    given_sources: list[Any] = (
+        [recording] if is_single else [*cast(Sequence[RecordingSource], recording)]
+    )
+    if not given_sources:
+        raise InputError(f"recording: expected {_EXPECTED_RECORDING}, found an empty list")
+    frames = [source for source in given_sources if isinstance(source, Frame)]
+    sources: list[str | Path | Recording] = []
+    for source in given_sources:
+        if isinstance(source, Frame):
+            number = f" {len(sources) + 1}" if len(given_sources) > 1 else ""
+            sources.append(read_frame_recording(source, frame_description, f"DataFrame{number}"))
+        else:
+            # Files have their own descriptions, so one that is given needs a data frame.
+            if not frames:
+                frame_description.refuse_for_files(source)
+            sources.append(source.recording if isinstance(source, SimulatedRecording) else source)
+    return sources

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bench.benchmark.isolation.process_errors import RunEndedError
-from bench.benchmark.problem.experiment import (
+from bench.benchmark.problem.experiment_config import (
     Experiment,
     TunerEntry,
     list_experiment_names,
@@ -19,9 +19,12 @@ from bench.benchmark.problem.robot_experiment import complete_robot_experiment
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.experiment_runner import ProgressFactory
-from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment, must_build_isolated
+from bench.benchmark.runner.plugin_inspection import (
+    load_plugins_for_experiment,
+    must_build_isolated,
+)
 from bench.benchmark.runner.trained_weights import TrainingResult, get_weights_folder
-from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
+from bench.benchmark.runner.tuner_process_start import make_tuner_spec
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.core.plugin_registries import simulators, tuners
 from bench.figures.loss_figure import LossRow, write_loss_figure

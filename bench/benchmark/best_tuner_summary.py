@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+import re
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -236,3 +237,18 @@ def _format_worse_tuner(row: dict[Any, Any]) -> str:
 def format_error_floor(statistics: ComparisonStatistics) -> str:
     """State which errors count as equal."""
     return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"
+
+
+def explain_first(worse: Sequence[str]) -> list[str]:
+    """Write out the first of several worse tuners, which explains the format of the others.
+
+    ``cma_es 5.8x (8/10)`` becomes ``cma_es 5.8x the error (larger on 8 of 10 targets)``.
+
+    Args:
+        worse: texts of tuners that are significantly worse than the best one.
+    """
+    first = [
+        re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", text)
+        for text in worse[:1]
+    ]
+    return [*first, *worse[1:]]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.error_curves import select_checkpoints, select_distance_checkpoints
@@ -24,7 +24,7 @@ from bench.benchmark.statistics.training_amortisation import (
     map_break_even_counts,
 )
 from bench.benchmark.storage.result_folder import StoredComparison
-from bench.figures.style import PANEL_TITLES, MarkStyle, TunerStyles
+from bench.figures.style import MarkStyle, TunerStyles
 from bench.pages.chart import (
     Axis,
     AxisSpan,
@@ -35,6 +35,15 @@ from bench.pages.chart import (
     make_method_series,
 )
 from bench.pages.text_format import format_number
+
+PANEL_TITLES = {
+    "in": "Targets in the training range",
+    "wide": "Targets anywhere in the bounds",
+    "real": "Recording",
+    "obs_error": "Runs tuned on",
+    "heldout_error": "Held-out runs, open loop",
+}
+"""Panel titles: ranges of targets, or kinds of runs of a recording."""
 
 
 class AxisLabels(NamedTuple):

@@ -1,30 +1,35 @@
 """Write the tables, figures and report page of a comparison, and print a summary.
 
 The figures can also be drawn again with reference results in grey behind the error curves.
+
+Page of one comparison, report.html: its data, conclusion and limitations.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+import shlex
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from bench.benchmark import comparison_figures
-from bench.benchmark.comparison_charts import ComparisonView, make_axis_labels
-from bench.benchmark.comparison_page import (
-    ComparisonReportData,
-    collect_text_values,
-    list_mean_seconds,
-    render_page,
-)
+from bench.benchmark import comparison_printed_figures
+from bench.benchmark.best_tuner_summary import RangeResult, explain_first, format_error_floor
+from bench.benchmark.comparison_charts import CHARTS, ComparisonView, make_axis_labels
+from bench.benchmark.comparison_printed_figures import FIGURE_FILES, format_threshold_caption
 from bench.benchmark.isolation.process_errors import ISOLATION_NOTE, without_isolation
+from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
 from bench.benchmark.problem.tuning_problem import numeric_warnings_silenced
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, build_tables
+from bench.benchmark.statistics.comparison_statistics import (
+    REQUIRED_RUN_COLUMNS,
+    ComparisonStatistics,
+    build_tables,
+)
 from bench.benchmark.statistics.error_curves import build_summary
-from bench.benchmark.storage.reference_results import ReferenceResult
+from bench.benchmark.statistics.training_amortisation import TARGETS_PER_TRAINING
 from bench.benchmark.storage.result_folder import (
     CONFIGURATION_FILE,
     StoredComparison,
@@ -32,36 +37,140 @@ from bench.benchmark.storage.result_folder import (
     read_environment,
 )
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER, read_plan
-from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
+from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES, FAILED_STATUSES
+from bench.figures.figure_layout import TRUSTED_TUNERS_NOTE
 from bench.figures.figure_output import (
     FigureFiles,
     render_all_formats,
-    write_figure,
     write_figures,
 )
+from bench.pages.html_page import HtmlPage
 from bench.pages.template import render_text
 from sims.core.files import write_atomically
-from sims.core.simulator import InputError
 
-REQUIRED_RUN_COLUMNS = (
-    "run",
-    "experiment",
-    "tuner",
-    "target",
-    "seed",
-    "range",
-    "k",
-    "param_error",
-    "param_abs_error",
-    "stiff_error",
-    "sloppy_error",
-    "obs_error",
-    "heldout_error",
-    "outside",
-    "tuner_seconds",
-    "simulator_seconds",
-)
-"""Columns of the runs that tables and figures use."""
+
+@dataclass(frozen=True)
+class ComparisonReportData:
+    """A comparison, as shown on its page.
+
+    Attributes:
+        view: The comparison with its statistics, labels and styles.
+        tables: Tables by name, as written next to the page.
+        pictures: Printed figures by name.
+        environment: Content of environment.json.
+        folder: Its folder, as named by the user.
+        configuration: Text of experiment.toml.
+        missing: Number of planned runs that have not been made yet.
+    """
+
+    view: ComparisonView
+    tables: Mapping[str, pd.DataFrame]
+    pictures: Mapping[str, FigureFiles]
+    environment: Mapping[str, Any]
+    folder: str
+    configuration: str
+    missing: int = 0
+
+    def format_rerun_command(self) -> str:
+        """Return the command that repeats the comparison."""
+        words = ["simgap", "compare", f"{self.folder}/experiment.toml"]
+        for plugin in self.environment.get("plugins", ()):
+            words += ["--plugin", plugin]
+        return shlex.join(words)
+
+
+def list_failures(view: ComparisonView) -> list[dict[str, Any]]:
+    """List every kind of failure with its first reason, the most frequent one first.
+
+    Runs that failed or were skipped are grouped by tuner, status and reason.
+    """
+    statuses = view.stored.statuses
+    failed = statuses[statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
+    groups = failed.groupby(["tuner", "status", "reason"], sort=False)["run"]
+    counts = groups.agg(run_count="size", run="first").reset_index()
+    counts = counts.sort_values("run_count", ascending=False, kind="stable")
+    return [{str(key): value for key, value in row.items()} for row in counts.to_dict("records")]
+
+
+def collect_text_values(results: ComparisonReportData) -> dict[str, Any]:
+    """Collect the values of both templates, that of the page and that of the printed summary.
+
+    Args:
+        results: Comparison with its statistics and tables.
+
+    Returns:
+        Values by their names in the templates.
+    """
+    view = results.view
+    return {
+        "results": results,
+        "view": view,
+        "range_results": [RangeResult(view.statistics, kind) for kind in view.ranges],
+        "floor_text": format_error_floor(view.statistics),
+        "shown_label": view.format_metric_label(view.shown_metric),
+        "trust_note": TRUSTED_TUNERS_NOTE if view.experiment.trusted else "",
+        "target_count": sum(view.statistics.target_counts.values()),
+    }
+
+
+def list_mean_seconds(results: ComparisonReportData) -> list[tuple[str, dict[Hashable, Any]]]:
+    """List the tuners, best first, each with the row of table.csv at the end of its budget."""
+    table = results.tables["table"]
+    last = table[table["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
+    order = [tuner for tuner in results.view.statistics.order if tuner in last.index]
+    return list(zip(order, last.loc[order].to_dict("records"), strict=True))
+
+
+_PAGE_TEMPLATE = Path(__file__).with_name("comparison.html")
+_DIGITS = 7
+"""Number of significant digits of values that are in no file next to the page."""
+
+
+def render_page(results: ComparisonReportData) -> str:
+    """Render the HTML page of a comparison of tuners.
+
+    Tables and chart data are written into the page, from which its script draws the charts.
+
+    Args:
+        results: Comparison with its view, tables and the pictures that exist.
+
+    Returns:
+        The page, which needs no other file.
+    """
+    view = results.view
+    page = HtmlPage({FIGURE_FILES[name]: files for name, files in results.pictures.items()})
+    page.add_tables(results.tables)
+    # Every chart has a printed figure if it has data, except for that of running times (ERT).
+    charts = {
+        name: make_chart(view) if name in results.pictures or name == "ert" else None
+        for name, make_chart in CHARTS.items()
+    }
+    for chart in charts.values():
+        page.add_tables(chart.tables if chart else {}, _DIGITS)
+    statuses = view.stored.statuses
+    values = collect_text_values(results)
+    # Rankings by range; `together` has those of all ranges after the same number of simulations.
+    rankings = [result.rankings for result in values["range_results"]]
+    return page.render(
+        _PAGE_TEMPLATE,
+        **values,
+        charts=charts,
+        tuner_count=view.stored.runs["tuner"].nunique(),
+        run_count=view.stored.runs["run"].nunique(),
+        together=list(zip(*rankings, strict=True)) if all(rankings) else [],
+        explain_first=explain_first,
+        failed_count=int(statuses["status"].isin(FAILED_STATUSES).sum()),
+        skipped_count=statuses[statuses["status"] == "skipped"]["tuner"].nunique(),
+        failures=list_failures(view),
+        mean_seconds=list_mean_seconds(results),
+        last_simulations=str(int(results.tables["table"]["simulations"].max())),
+        threshold_caption=format_threshold_caption(view.statistics.runtime_thresholds),
+        stiff_threshold=f"{STIFF_SIGMA_THRESHOLD:g}",
+        targets_per_training=TARGETS_PER_TRAINING,
+        figure_files=FIGURE_FILES,
+    )
+
+
 REPORT_FILE = "report.html"
 """File name of the report page in the folder of a comparison."""
 _TEMPLATE = Path(__file__).with_name("comparison.txt")
@@ -95,7 +204,7 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
     for name, frame in tables.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
     pictures = _render_figures(view)
-    files = {comparison_figures.FIGURE_FILES[name]: pictures[name] for name in pictures}
+    files = {comparison_printed_figures.FIGURE_FILES[name]: pictures[name] for name in pictures}
     figures = [path for path in write_figures(folder, files) if path.suffix == ".png"]
     results = ComparisonReportData(
         view=view,
@@ -125,57 +234,13 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
     return int((failed["status"] != "skipped").sum())
 
 
-def draw_with_references(
-    folder: Path,
-    references: Sequence[ReferenceResult],
-    out: Path,
-    print_line: Callable[[str], None],
-    before: str = "",
-) -> list[dict[str, Any]]:
-    """Draw a comparison's figures again with references behind them, as separate files.
-
-    Args:
-        folder: folder of the comparison.
-        references: reference results to draw.
-        out: folder in whose subfolder ``figures`` the files are written.
-        print_line: callback that prints one line; it gets differences of the references, and files.
-        before: prefix of the file names.
-
-    Returns:
-        JSON document of each reference, with its differences and the files.
-
-    Raises:
-        InputError: a reference belongs to another problem, or there are too many.
-    """
-    stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
-    if stored.runs.empty:
-        raise InputError(f"{folder}: contains no runs")
-    comparison_figures.check_references_allowed(
-        stored, comparison_figures.OVERLAYABLE_FIGURES[0], references
-    )
-    labels = make_axis_labels(stored.experiment)
-    for reference in references:
-        print_line(f"behind  {reference.provenance_text}")
-        for line in reference.find_mismatches(stored.experiment):
-            print_line(f"differs {line}")
-    files = []
-    for name in comparison_figures.list_figure_names(stored):
-        if name in comparison_figures.OVERLAYABLE_FIGURES:
-            figure = comparison_figures.draw_figure(stored, labels, name, references=references)
-            file_name = f"{before}{comparison_figures.FIGURE_FILES[name]}-behind"
-            paths = write_figure(figure, out / "figures" / file_name)
-            files += paths
-            print_line(f"figure  {paths[0]}")
-    return [reference.to_document(stored.experiment, files) for reference in references]
-
-
 def _render_figures(view: ComparisonView) -> dict[str, FigureFiles]:
     """Render all figures that exist for the comparison, by name."""
     return {
         name: render_all_formats(
-            comparison_figures.draw_figure(view.stored, view.labels, name, view.statistics)
+            comparison_printed_figures.draw_figure(view.stored, view.labels, name, view.statistics)
         )
-        for name in comparison_figures.list_figure_names(view.stored)
+        for name in comparison_printed_figures.list_figure_names(view.stored)
     }
 
 

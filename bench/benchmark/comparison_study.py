@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.benchmark.runner.study_base import PrintLine, Study
-from bench.benchmark.storage.csv_reader import RunsTable
 from bench.benchmark.storage.result_file_consistency import (
+    RunsTable,
     check_journal_statuses,
     check_plan,
     check_rows_match_statuses,
@@ -250,7 +250,7 @@ class Comparison(Study):
             results: Runs of the experiment with the information spectrum of each target.
         """
         if results.spectra:
-            from bench.benchmark.statistics.comparison_statistics import build_identifiability_table
+            from bench.benchmark.problem.fisher_information import build_identifiability_table
 
             problem = results.problem
             table = build_identifiability_table(

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_sampling import ShotSetup, get_stream_prefix
 from bench.bounce_shot.true_world import GRAVITY, InclinedGround, simulate_shot
 from bench.core.random_streams import make_rng
 from bench.figures.ball_track_figure import render_track_figure
-from bench.logs import film_tracking
+from bench.logs import ball_heights_from_film
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
@@ -88,7 +88,7 @@ def film_and_track_drop(
         {get_camera_file_path(film): format_camera_file(FilmDescription(camera, radius))},
     )
     scene.close()
-    film_tracking.track_film(film, path, render_track_figure, scale="camera")
+    ball_heights_from_film.track_film(film, path, render_track_figure, scale="camera")
 
 
 RECORDINGS_FOLDER = "recordings"

@@ -8,8 +8,6 @@ import pandas as pd
 
 from bench.benchmark.statistics.proportion_interval import compute_proportion_interval
 from bench.benchmark.storage.run_status import FAILED_STATUSES
-from bench.figures.style import get_mark_style
-from bench.pages.chart import Axis, Panel, make_method_series
 
 ALL_BALLS = "all"
 """Value of the column ball for all kinds of balls together."""
@@ -79,34 +77,3 @@ def _compute_table_row(method: str, ball: str, part: pd.DataFrame) -> list[objec
         part["seconds"].mean(),
         failures,
     ]
-
-
-def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
-    """Make the panel of a chart that shows the hit rate of each method by ball.
-
-    Args:
-        lines: table of `build_result_table`.
-
-    Returns:
-        The panel, and its table: the lines with the position of their ball on the horizontal axis
-        as column ``place``.
-    """
-    # All balls together come first.
-    balls = [ALL_BALLS, *(ball for ball in dict.fromkeys(lines["ball"]) if ball != ALL_BALLS)]
-    places = {ball: place for place, ball in enumerate(balls)}
-    methods = dict.fromkeys(lines["method"])
-    styles = {method: get_mark_style(number) for number, method in enumerate(methods)}
-    series = make_method_series(
-        styles, "method", "rate", is_shifted=True, low="low", high="high", draw="points"
-    )
-    # Methods may have different numbers of shots, if some are missing.
-    counts = lines.groupby("ball")["shots"].agg(["min", "max"]).astype(int)
-    names = []
-    for ball in balls:
-        shot_counts = dict.fromkeys(counts.loc[ball].tolist())
-        names.append(f"{ball}\nn={'–'.join(map(str, shot_counts))}")
-    x_axis = Axis("ball; n shots of each method", names=tuple(names))
-    # A margin of 0.03, so that marks at 0 and 1 are visible.
-    y_axis = Axis("share of shots through the hoop", scales=("linear",), ends=(-0.03, 1.03))
-    panel = Panel("Hits by ball", "success", "place", series, x_axis, y_axis)
-    return panel, lines.assign(place=lines["ball"].map(places))

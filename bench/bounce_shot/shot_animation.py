@@ -11,10 +11,10 @@ import numpy as np
 from bench.bounce_shot.drop_recording import RECORDINGS_FOLDER
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import SAMPLING_RATE_HZ, ExampleShot, execute_example
-from bench.bounce_shot.shot_figures import draw_shot_panel
-from bench.bounce_shot.shot_geometry import find_path_end
+from bench.bounce_shot.shot_figures import draw_shot_panel, find_path_end
 from bench.bounce_shot.shot_sampling import ShotSetup
-from bench.figures.style import BLUE, TRUSTED_TUNERS_NOTE, VERMILION, make_panel_grid
+from bench.figures.figure_layout import TRUSTED_TUNERS_NOTE, make_panel_grid
+from bench.figures.style import BLUE, VERMILION
 from sims.core.simulator import Array, InputError
 from sims.recording.recording import read_recording
 from sims.systems.ball import Ball

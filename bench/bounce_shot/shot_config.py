@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (

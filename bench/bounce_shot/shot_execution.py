@@ -11,9 +11,9 @@ import numpy as np
 
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_geometry import compute_hoop_crossings, find_descent_index
+from bench.bounce_shot.shot_planner import TunedModel, make_planning_model
 from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.bounce_shot.true_world import InclinedGround, simulate_shot
-from bench.bounce_shot.tuned_shots import TunedModel, make_planning_model
 from sims.core.simulator import Array
 
 SAMPLING_RATE_HZ = 240.0

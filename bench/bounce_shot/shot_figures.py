@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.problem.experiment import Experiment
-from bench.bounce_shot.hit_rate_table import make_success_panel
-from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_execution import ExampleShot, execute_example
-from bench.bounce_shot.shot_geometry import find_path_end
-from bench.bounce_shot.shot_sampling import ShotSetup
-from bench.bounce_shot.tuned_shots import (
+from bench.benchmark.problem.experiment_config import Experiment
+from bench.bounce_shot.drop_tuning import (
     EXPLAIN_METHOD,
     EXPLAIN_SUFFIX,
     UNTUNED_METHOD,
 )
+from bench.bounce_shot.hit_rate_table import ALL_BALLS
+from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_execution import ExampleShot, execute_example
+from bench.bounce_shot.shot_geometry import ShotGeometry, find_descent_index
+from bench.bounce_shot.shot_sampling import ShotSetup
+from bench.figures.figure_layout import add_trust_note, make_panel_grid
 from bench.figures.figure_output import FigureFiles, render_all_formats
 from bench.figures.style import (
     BLACK,
@@ -29,10 +30,9 @@ from bench.figures.style import (
     GREY,
     INCLINE_GREY,
     VERMILION,
-    add_trust_note,
-    make_panel_grid,
+    get_mark_style,
 )
-from bench.pages.chart_figure import draw_chart, finish_chart
+from bench.pages.chart import Axis, Panel, draw_chart, finish_chart, make_method_series
 from sims.core.simulator import Array
 
 if TYPE_CHECKING:
@@ -48,6 +48,9 @@ _GROUP_LABELS = {
 }
 _MAX_MISS_RADII = 6
 """Range of the shown misses, in radii of the hoop."""
+
+_MIN_DRAWN_DEPTH = 0.12
+"""Distance below the hoop down to which paths are drawn, m."""
 
 
 def draw_figures(
@@ -319,3 +322,46 @@ def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot
     right_limit = scene.hoop_x + 4 * scene.hoop_radius
     axis.set(xlim=(-0.25, right_limit), ylim=(-0.35, shot.top), aspect="equal")
     axis.spines[["top", "right"]].set_visible(False)
+
+
+def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
+    """Make the panel of a chart that shows the hit rate of each method by ball.
+
+    Args:
+        lines: table of `build_result_table`.
+
+    Returns:
+        The panel, and its table: the lines with the position of their ball on the horizontal axis
+        as column ``place``.
+    """
+    # All balls together come first.
+    balls = [ALL_BALLS, *(ball for ball in dict.fromkeys(lines["ball"]) if ball != ALL_BALLS)]
+    places = {ball: place for place, ball in enumerate(balls)}
+    methods = dict.fromkeys(lines["method"])
+    styles = {method: get_mark_style(number) for number, method in enumerate(methods)}
+    series = make_method_series(
+        styles, "method", "rate", is_shifted=True, low="low", high="high", draw="points"
+    )
+    # Methods may have different numbers of shots, if some are missing.
+    counts = lines.groupby("ball")["shots"].agg(["min", "max"]).astype(int)
+    names = []
+    for ball in balls:
+        shot_counts = dict.fromkeys(counts.loc[ball].tolist())
+        names.append(f"{ball}\nn={'–'.join(map(str, shot_counts))}")
+    x_axis = Axis("ball; n shots of each method", names=tuple(names))
+    # A margin of 0.03, so that marks at 0 and 1 are visible.
+    y_axis = Axis("share of shots through the hoop", scales=("linear",), ends=(-0.03, 1.03))
+    panel = Panel("Hits by ball", "success", "place", series, x_axis, y_axis)
+    return panel, lines.assign(place=lines["ball"].map(places))
+
+
+def find_path_end(path: Array, scene: ShotGeometry) -> int:
+    """Return the number of samples to draw of a path.
+
+    After its bounce, a path is drawn down to `_MIN_DRAWN_DEPTH` below the hoop.
+
+    Args:
+        path: positions, (T, 3), m.
+        scene: incline and hoop.
+    """
+    return find_descent_index(path, scene.hoop_z - _MIN_DRAWN_DEPTH) + 1

@@ -110,19 +110,3 @@ def find_descent_index(path: Array, height: float) -> int:
     has_bounced = np.logical_or.accumulate(heights[1:] > heights[:-1])
     is_descent = has_bounced & (heights[:-1] > height) & (heights[1:] <= height)
     return int(np.argmax(is_descent)) if is_descent.any() else len(heights) - 1
-
-
-_MIN_DRAWN_DEPTH = 0.12
-"""Distance below the hoop down to which paths are drawn, m."""
-
-
-def find_path_end(path: Array, scene: ShotGeometry) -> int:
-    """Return the number of samples to draw of a path.
-
-    After its bounce, a path is drawn down to `_MIN_DRAWN_DEPTH` below the hoop.
-
-    Args:
-        path: positions, (T, 3), m.
-        scene: incline and hoop.
-    """
-    return find_descent_index(path, scene.hoop_z - _MIN_DRAWN_DEPTH) + 1

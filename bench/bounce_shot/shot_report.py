@@ -9,19 +9,14 @@ from typing import Any
 import pandas as pd
 
 from bench.benchmark.comparison_report import REPORT_FILE
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.statistics.comparison_statistics import add_trust_column
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES
-from bench.bounce_shot.hit_rate_table import (
-    ALL_BALLS,
-    NO_SHOT_STATUSES,
-    build_result_table,
-    make_success_panel,
-)
+from bench.bounce_shot.hit_rate_table import ALL_BALLS, NO_SHOT_STATUSES, build_result_table
 from bench.bounce_shot.shot_animation import write_animation
 from bench.bounce_shot.shot_config import ShotConfig
-from bench.bounce_shot.shot_figures import draw_figures, select_example_shots
+from bench.bounce_shot.shot_figures import draw_figures, make_success_panel, select_example_shots
 from bench.bounce_shot.shot_sampling import ShotSetup
 from bench.bounce_shot.shot_storage import read_shot
 from bench.figures import figure_output

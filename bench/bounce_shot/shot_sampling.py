@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.bounce_shot.shot_config import BallKind, ShotConfig, get_ball_kind
 from bench.bounce_shot.shot_geometry import ShotGeometry
 from bench.core.random_streams import PUBLIC_SALT, make_rng

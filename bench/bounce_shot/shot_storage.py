@@ -23,10 +23,10 @@ from bench.benchmark.storage.table_schemas import (
 )
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import ShotResult, execute_shot
+from bench.bounce_shot.shot_planner import TunedModel
 from bench.bounce_shot.shot_sampling import ShotSetup
-from bench.bounce_shot.tuned_shots import TunedModel
 from sims.core.files import write_atomically
-from sims.core.plain_values import to_json_value
+from sims.core.json_documents import to_json_value
 from sims.core.simulator import InputError
 
 
@@ -109,7 +109,7 @@ def store_shot(
         folder: result folder of the study.
         setup: ball, scene and release error.
         settings: the [shot] table of the study.
-        models: models as returned by `bench.bounce_shot.tuned_shots.tune_and_plan`.
+        models: models as returned by `bench.bounce_shot.drop_tuning.tune_and_plan`.
         visible_share: fraction of the drop's sample times at which its recording has a height.
     """
     rows = []

@@ -13,12 +13,12 @@ import numpy as np
 
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
 from bench.benchmark.isolation.tuner_processes import TunerSpec
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.runner.experiment_runner import ProgressFactory, check_tuners, no_progress
-from bench.benchmark.runner.plugin_discovery import check_classes_importable, describe_plugins
+from bench.benchmark.runner.plugin_inspection import check_classes_importable, describe_plugins
 from bench.benchmark.runner.study_base import PreparedStudy, PrintLine, Study
 from bench.benchmark.runner.trained_weights import TrainingResult, get_weights_folder
-from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
+from bench.benchmark.runner.tuner_process_start import make_tuner_spec
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import Call, Pool, make_pool
 from bench.benchmark.storage.run_status import (
@@ -26,12 +26,13 @@ from bench.benchmark.storage.run_status import (
     RunEnd,
     StudyOutcome,
 )
-from bench.bounce_shot import true_world, tuned_shots
+from bench.bounce_shot import drop_tuning, true_world
 from bench.bounce_shot.drop_recording import RECORDINGS_FOLDER, record_drop
+from bench.bounce_shot.drop_tuning import make_failed_models
 from bench.bounce_shot.shot_config import ShotConfig, read_shot_config
+from bench.bounce_shot.shot_planner import TunedModel
 from bench.bounce_shot.shot_sampling import ShotSetup, draw_shots
 from bench.bounce_shot.shot_storage import SHOTS_FOLDER, check_shots, list_missing_shots, store_shot
-from bench.bounce_shot.tuned_shots import TunedModel
 from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
@@ -271,7 +272,7 @@ class _ShotStages:
         """
         learned_entries = [e for e in self._experiment.tuners if tuners.get(e.tuner).learned]
         experiments = [
-            tuned_shots.make_tuning_experiment(self._experiment, self._settings, entry)
+            drop_tuning.make_tuning_experiment(self._experiment, self._settings, entry)
             for entry in learned_entries
         ]
         calls: list[Call] = [
@@ -315,20 +316,20 @@ class _ShotStages:
         calls: list[Call] = []
         for index in recorded:
             setup = self._missing_shots[index]
-            inputs = tuned_shots.ShotInputs(
+            inputs = drop_tuning.ShotInputs(
                 setup.name, self._paths[index], setup.scene, weights, self._tuned, self._hidden
             )
-            calls.append((tuned_shots.tune_and_plan, (self._experiment, self._settings, inputs)))
+            calls.append((drop_tuning.tune_and_plan, (self._experiment, self._settings, inputs)))
         step = self._progress("shooting", len(self._missing_shots))
         for index, error in recording_errors.items():
             status = "no recording" if isinstance(error, InputError) else "crashed"
-            failed_models = _make_failed_models(self._experiment, error, status)
+            failed_models = make_failed_models(self._experiment, error, status)
             self._store(index, failed_models, visible_share=0.0)
             step()
         for position, models in workers.iterate_results(calls, self._experiment.timeout):
             index = recorded[position]
             if isinstance(models, BaseException):
-                models = _make_failed_models(self._experiment, models)
+                models = make_failed_models(self._experiment, models)
             run = read_recording(self._paths[index], BallSimulator, whole=True).runs[0]
             visible_samples = float(np.isfinite(run.channels["z"]).sum())
             self._store(index, models, visible_samples / self._experiment.sampling.samples)
@@ -345,38 +346,3 @@ class _ShotStages:
         store_shot(
             self._study.folder, self._missing_shots[index], self._settings, models, visible_share
         )
-
-
-def _make_failed_models(
-    experiment: Experiment, error: BaseException, status: str = "crashed"
-) -> list[TunedModel]:
-    """Make a failed model of each method, for a shot whose recording or planning failed.
-
-    None of them has a plan, so that the shot counts as a miss of every method.
-
-    Args:
-        experiment: the experiment with its tuners.
-        error: the error of the recording or of the worker.
-        status: status of the models; it is "timeout" if the error is a timeout.
-    """
-    if isinstance(error, TimeoutError):
-        status = "timeout"
-    labels = [entry.label for entry in experiment.tuners]
-    methods = [
-        tuned_shots.UNTUNED_METHOD,
-        *labels,
-        tuned_shots.EXPLAIN_METHOD,
-        *(label + tuned_shots.EXPLAIN_SUFFIX for label in labels),
-    ]
-    return [
-        TunedModel(
-            method,
-            restitution=math.nan,
-            effects={},
-            simulations=0,
-            seconds=math.nan,
-            status=status,
-            reason=str(error),
-        )
-        for method in methods
-    ]

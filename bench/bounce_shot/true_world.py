@@ -33,7 +33,7 @@ import numpy as np
 
 from bench.bounce_shot.shot_config import BallKind
 from sims.core.simulator import Array, InputError
-from sims.engines.external.mujoco_balls import compute_damping_ratio
+from sims.engines.external.mujoco_ball_contact import compute_damping_ratio
 
 AIR_DENSITY = 1.2
 """Density of air, kg/m^3."""

@@ -203,7 +203,7 @@ class _Parser(argparse.ArgumentParser):
         """Report an unknown command or option with the most similar known ones."""
         from difflib import get_close_matches
 
-        from sims.core.plain_values import truncate_text
+        from sims.core.user_messages import truncate_text
 
         similar_names = get_close_matches(
             name[:_MAX_COMPARED_CHARACTERS], list(known_names), cutoff=0.5

@@ -3,6 +3,8 @@
 A command is a function of its options and of `print_line`, which prints one line of text at once.
 It returns a `CommandResult`, which contains the same information as JSON. One of the two printers
 here prints either the one or the other; so every command has ``--json``, and errors have one form.
+
+Summary of a study's folder for the JSON documents of commands: its files and results.
 """
 
 from __future__ import annotations
@@ -12,9 +14,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from sims.core.plain_values import to_json_value
+from sims.core.json_documents import to_json_value
+
+if TYPE_CHECKING:
+    from bench.benchmark.runner.study_base import Study
+
 
 JsonDocument = dict[str, Any]
 """Data that can be written as JSON after conversion by `to_json_value`."""
@@ -128,3 +135,44 @@ def _flush_c() -> None:
         ctypes.CDLL(None).fflush(None)
     except (AttributeError, OSError, TypeError):  # C's library is not accessible in the program.
         return
+
+
+_FIGURES_FOLDER = "figures"
+"""Name of the folder of figures."""
+
+
+def summarise_study(study: Study) -> JsonDocument:
+    """Summarise a study: name, folder, files, isolation, kind of salt, and results."""
+    experiment = study.configuration.experiment
+    return {
+        "name": experiment.name,
+        "folder": study.folder,
+        "trusted": experiment.trusted,
+        "salt": "secret" if experiment.salt_sha256 else "public",
+        "files": list_result_files(study.folder),
+        "results": summarise_results(study.folder / "table.csv"),
+    }
+
+
+def list_result_files(folder: Path) -> list[Path]:
+    """List the files of a result folder and its figures, without the data of single runs."""
+    paths = [*folder.glob("*"), *(folder / _FIGURES_FOLDER).glob("*")]
+    return sorted(path for path in paths if path.is_file() and not path.name.startswith("."))
+
+
+def summarise_results(table: Path) -> list[JsonDocument]:
+    """Read the last row of each tuner, range and metric from a table.
+
+    All rows are read for bounce shots and diagnosers, and none if there is no table.
+    """
+    if not table.is_file():
+        return []
+    import pandas as pd
+
+    # Only empty cells are missing values, and names such as "None" are not.
+    lines = pd.read_csv(table, keep_default_na=False, na_values=[""]).astype(object)
+    if "simulations" in lines and "metric" in lines:
+        # Rows are ordered by the number of simulations.
+        lines = lines.groupby(["tuner", "range", "metric"], sort=False, dropna=False).tail(1)
+    rows = lines.where(lines.notna(), None).to_dict("records")
+    return [{str(name): value for name, value in row.items()} for row in rows]

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 def add_options(
     parser: argparse.ArgumentParser, options: type, **changed: Mapping[str, Any]
 ) -> None:
-    """Add the options of a command that an options dataclass declares by `bench.core.options`.
+    """Add the options of a command that an options dataclass declares.
+
+    The decorators are in `bench.core.option_dataclasses`.
 
     So options of the command line and arguments in Python are declared once. The annotation of a
     field decides how a value is parsed, and its entry in the class docstring is the help.
@@ -28,7 +30,7 @@ def add_options(
         options: Options dataclass.
         changed: By field, arguments of `add_argument` that differ from those of the declaration.
     """
-    from bench.core.options import read_option_texts
+    from bench.core.option_dataclasses import read_option_texts
 
     texts = read_option_texts(options)
     # Inherited options are listed last: their names are not attributes of the class itself.
@@ -153,7 +155,8 @@ def _parse_whole_number(text: str, minimum: int) -> int:
     Raises:
         argparse.ArgumentTypeError: the text is not such a number.
     """
-    from sims.core.plain_values import MAX_INTEGER, truncate_text
+    from sims.core.number_limits import MAX_INTEGER
+    from sims.core.user_messages import truncate_text
 
     try:
         value = int(text)
@@ -180,7 +183,7 @@ def parse_seconds(text: str) -> float:
 
 def parse_path(text: str) -> Path:
     """Parse the path of a file or folder, which need not exist."""
-    from sims.core.plain_values import truncate_text
+    from sims.core.user_messages import truncate_text
 
     try:
         Path(text).lstat()

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.benchmark.runner.plugin_discovery import Plugin
+from bench.benchmark.runner.plugin_inspection import Plugin
 from bench.benchmark.runner.worker_pools import LocalPool
 from sims.core.simulator import Array
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.benchmark.runner.plugin_discovery import Plugin
+from bench.benchmark.runner.plugin_inspection import Plugin
 from bench.benchmark.runner.worker_pools import LocalPool
 from bench.conformance.check_base import CALL_TIMEOUT_SECONDS, Check, CheckError
 from bench.conformance.diagnoser_checks import DIAGNOSER_CHECKS

@@ -11,8 +11,7 @@ import numpy as np
 from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
 from sims.core.simulator import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
 from sims.core.unit_cube import UnitCube
-from sims.own_simulator import OwnSimulator
-from sims.own_simulator_engine import get_checked_inertia, observed
+from sims.own_simulator import OwnSimulator, get_checked_inertia, observed
 from sims.recording.unit_conversion import is_unit
 
 _FORCED_STEPS = 20

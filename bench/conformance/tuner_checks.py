@@ -7,7 +7,7 @@ import inspect
 import pickle
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from bench.benchmark.isolation.process_errors import KilledExternallyError, RunE
 from bench.benchmark.isolation.tuner_processes import IsolatedRun, TunerSpec
 from bench.benchmark.runner.preloadable_packages import find_preloadable_packages
 from bench.benchmark.runner.tuner_loop import RunTrace, drive_tuner
-from bench.benchmark.runner.tuner_process_reuse import start_isolated_tuner
+from bench.benchmark.runner.tuner_process_start import start_isolated_tuner
 from bench.conformance.check_base import (
     Check,
     CheckError,
@@ -27,14 +27,23 @@ from bench.conformance.check_base import (
     check_global_random_state,
     is_bitwise_equal,
 )
-from bench.conformance.sample_subjects import (
-    TRAINED_TUNERS,
+from bench.conformance.toy_systems import (
+    SAMPLE_TIMES,
+    TRAINING_RANGE_HIGH,
+    TRAINING_RANGE_LOW,
     make_evaluate,
     make_task,
-    make_trained_tuner,
-    run_tuner,
+    simulate_toy_problem,
 )
-from methods.tuner import Evaluation, Proposal, Task, Tuner, TunerGenerator
+from methods.tuner import (
+    EMPTY_SCENE,
+    BudgetExceededError,
+    Evaluation,
+    Proposal,
+    Task,
+    Tuner,
+    TunerGenerator,
+)
 from sims.core.simulator import Array
 
 _RUN_SIMULATIONS = 5
@@ -43,6 +52,12 @@ _SEED = 0
 """Seed of the runs that are compared."""
 _SIGNIFICANCE_LEVEL = 0.05
 """Significance level of the comparison with random search, over all targets together."""
+
+FIT_BUDGET = 240
+"""Number of training simulations of a trained tuner; small, so that the suite is fast."""
+
+TRAINED_TUNERS: dict[tuple[type[Tuner], int], dict[str, Array]] = {}
+"""Trained state of each tuner in this process, by class and dimension, because training is slow."""
 
 
 def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
@@ -577,3 +592,88 @@ TUNER_CHECKS: Mapping[Check, tuple[Check, ...]] = {
     check_same_run_when_sealed: (check_same_run_in_other_processes,),
 }
 """Checks in the order in which they run, each with those that must pass for it to be meaningful."""
+
+
+class ToyTrainingSimulator:
+    """Training simulator of the toy problem; see `methods.tuner.TrainingSimulator`."""
+
+    def __init__(self, dim: int) -> None:
+        """Set the sizes of the toy problem: two channels of 40 samples, and `dim` parameters."""
+        self.dim, self.scale = dim, np.ones(2)
+        self.lengths: tuple[int, ...] = (SAMPLE_TIMES.size,)
+        self.scene = EMPTY_SCENE
+        self.training = np.array([[TRAINING_RANGE_LOW] * dim, [TRAINING_RANGE_HIGH] * dim])
+        self.used, self.budget = 0, FIT_BUDGET
+
+    def sample(self, rng: np.random.Generator, n: int) -> Array:
+        """Draw parameters uniformly from the training range.
+
+        Args:
+            rng: random generator.
+            n: number of points.
+        """
+        return rng.uniform(TRAINING_RANGE_LOW, TRAINING_RANGE_HIGH, size=(n, self.dim))
+
+    def simulate(self, rng: np.random.Generator, points: Array) -> Array:  # noqa: ARG002
+        """Simulate points, and count the simulations.
+
+        Args:
+            rng: not used.
+            points: points in the unit cube, (n, dim).
+
+        Returns:
+            Observations, (n, 40, 2).
+
+        Raises:
+            CheckError: a point is outside the training range.
+            BudgetExceededError: the training budget is exceeded.
+        """
+        if not ((points >= TRAINING_RANGE_LOW) & (points <= TRAINING_RANGE_HIGH)).all():
+            raise CheckError(
+                "expected training inside the training range; found a point outside; see `fit`"
+            )
+        self.used += len(points)
+        if self.used > self.budget:
+            raise BudgetExceededError(f"{self.used} training simulations, {self.budget} allowed")
+        return simulate_toy_problem(points)
+
+
+def make_trained_tuner(kind: type[Tuner], dim: int = 2, anew: bool = False) -> Tuner:
+    """Make a tuner, trained on the toy problem if necessary.
+
+    Args:
+        kind: class of the tuner.
+        dim: number of parameters.
+        anew: whether to train again instead of using the cached state.
+    """
+    tuner = kind()
+    if not anew and (kind, dim) in TRAINED_TUNERS:
+        tuner.restore(TRAINED_TUNERS[kind, dim])
+        return tuner
+    tuner.fit(ToyTrainingSimulator(dim), np.random.default_rng(0), FIT_BUDGET)
+    if kind.learned:
+        TRAINED_TUNERS[kind, dim] = tuner.state()
+    return tuner
+
+
+def run_tuner(
+    tuner: Tuner,
+    budget: int,
+    dim: int = 2,
+    seed: int = 0,
+    fails: Callable[[int], bool] = lambda _: False,
+    target: int = 0,
+) -> RunTrace:
+    """Run a tuner on the toy problem.
+
+    Args:
+        tuner: instance of the tuner.
+        budget: maximum number of simulations.
+        dim: number of parameters.
+        seed: seed of the run.
+        fails: returns whether simulation number k fails.
+        target: seed of the task.
+    """
+    task, _ = make_task(budget, dim, target)
+    evaluate = make_evaluate(task, fails)
+    return drive_tuner(tuner, task, evaluate, np.random.default_rng(seed))

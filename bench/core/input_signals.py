@@ -9,8 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sims.core.plain_values import MAX_NUMBER, truncate_text
+from sims.core.number_limits import MAX_NUMBER
 from sims.core.simulator import Array, InputError, make_unknown_name_error
+from sims.core.user_messages import truncate_text
 
 _TAU = 2 * np.pi
 """Radians of one period."""

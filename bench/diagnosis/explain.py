@@ -29,10 +29,10 @@ from bench.diagnosis.pipeline.convention_and_unit_checks import (
     refuse_broken_conventions,
 )
 from bench.diagnosis.pipeline.extended_simulator_builder import build_extended_simulator
-from bench.diagnosis.pipeline.left_out_segments import leave_out_jumps
 from bench.diagnosis.pipeline.recording_preparation import RecordingSource, prepare_runs
 from bench.diagnosis.pipeline.report_data_builder import build_report_data
 from bench.diagnosis.pipeline.search_result import SearchResult
+from bench.diagnosis.pipeline.segment_choice import leave_out_jumps
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext, SimulatedRuns
 from bench.diagnosis.pipeline.solver_option_choice import SolverOptionChoice
 from bench.diagnosis.pipeline.time_step_choice import TimeStepChoice

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from bench.diagnosis.evaluation.search_control import ProgressListener, SearchControl
-from bench.logs.recording_loading import FrameDescription
 from sims.core.argument_checks import Count, Name, Names, Seconds
+from sims.recording.recording_frame import FrameDescription
 
 
 def _discard_note(_line: str) -> None:

@@ -8,21 +8,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.diagnosis.extended_robot_files import (
-    ExtendedRobotFiles,
-    build_robot_files,
-    find_model_file_changes,
-)
+from bench.diagnosis.extended_robot_files import ExtendedRobotFiles, build_robot_files
 from bench.diagnosis.randomization_ranges import RandomizationRanges, list_randomization_ranges
 from bench.diagnosis.report import explanation_figures
-from bench.diagnosis.report.consistency_section import AGREEMENT_COLUMNS, build_consistency_rows
-from bench.diagnosis.report.effect_and_unit_text import (
-    format_fitted_value,
+from bench.diagnosis.report.cause_and_value_text import (
+    format_cause_with_values,
     format_percent,
-    joined,
     sanitise,
 )
+from bench.diagnosis.report.consistency_section import AGREEMENT_COLUMNS, build_consistency_rows
 from bench.diagnosis.report.explanation_page import render_report
+from bench.diagnosis.report.model_file_changes import find_model_file_changes
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.report.summary_text import format_early_stop, format_interval, has_gap_closed
 from bench.diagnosis.search.verdict_rules import VerdictName
@@ -184,7 +180,7 @@ class Explanation:
         return "\n".join(sanitise(line, MAX_TEXT_WIDTH) for line in lines if line)
 
     def _format_causes(self) -> str:
-        return "; ".join(_format_cause(cause) for cause in self.causes)
+        return "; ".join(format_cause_with_values(cause) for cause in self.causes)
 
     def _format_gain(self) -> str:
         """Return the share of the gap that is closed; empty if nothing was found or measured."""
@@ -202,16 +198,3 @@ class Explanation:
         return make_iframe(
             render_report(self._report_data, explanation_figures.render_figures(self.story))
         )
-
-
-def _format_cause(cause: Cause) -> str:
-    """Format a cause, its alternatives and its numbers.
-
-    For example ``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴)
-    N·s/m``.
-    """
-    effects = joined([cause.effect, *cause.alternatives], "or")
-    numbers = [
-        f"{name} {format_fitted_value(number)}" for name, number in cause.coefficients.items()
-    ]
-    return f"{effects}: {joined(numbers)}"

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from difflib import SequenceMatcher
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.diagnosis.report.report_data import ModelFileChange
 from sims.core.freed_memory import release_free_memory
-from sims.core.plain_values import append_unit
+from sims.core.user_messages import append_unit
 from sims.extended_simulator import ExtendedSimulator, FittedValue
+from sims.robot.fitted_causes import collect_causes
 
 if TYPE_CHECKING:
     from sims.robot.export.write_model_file import WrittenModelFiles
@@ -173,147 +171,3 @@ def _collect_written_files(written_files: WrittenModelFiles) -> dict[str, str]:
     """Return the content of each extended model file that was written, by file name."""
     contents = {"extended.xml": written_files.xml, "extended.urdf": written_files.urdf}
     return {name: content for name, content in contents.items() if content is not None}
-
-
-def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, FittedValue]]:
-    """Collect the fitted changes of a robot as coefficients by effect.
-
-    They are numbers of its model file that the user freed for the fit, diagnosed effects, and the
-    time step and other options of the integrator if they differ from those of the file.
-
-    Args:
-        extended: extended simulator of a robot, with the fitted values.
-    """
-    kind: Any = extended.kind
-    causes: dict[str, Mapping[str, FittedValue]] = {}
-    for effect in kind.system.freed_effects:
-        names = [coefficient.name for coefficient in effect.coefficients]
-        # A freed number is a parameter with the name of its effect, and of its coefficient if there
-        # are several.
-        parameters = (
-            [effect.name] if len(names) == 1 else [f"{effect.name}.{name}" for name in names]
-        )
-        causes[effect.name] = {
-            name: extended.parameters[parameter]
-            for name, parameter in zip(names, parameters, strict=True)
-        }
-    return {**causes, **extended.effects, **_list_numerics_causes(kind)}
-
-
-def _list_numerics_causes(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
-    """Return the options of the model as causes, if they differ from those of the model file.
-
-    The step is in seconds; an option that is a word in the file has its MuJoCo number. They have no
-    intervals because they are chosen, not fitted.
-    """
-    from sims.robot.integrator_settings import list_changed_options
-
-    return {
-        effect: {effect.removeprefix("numerics."): make_option_value(effect, *numbers)}
-        for effect, numbers in list_changed_options(kind.robot, kind.numerics).items()
-    }
-
-
-def make_option_value(effect: str, stated: float, number: float) -> FittedValue:
-    """Return the value of a changed option of the model file, which is chosen and has no interval.
-
-    Args:
-        effect: Effect that names the option, such as ``numerics.impratio``.
-        stated: Number in the model file.
-        number: Number that replaces it.
-    """
-    unit = "s" if effect == "numerics.step" else "1"
-    return FittedValue(float(number), unit, None, None, stated=float(stated), total=float(number))
-
-
-MIN_UNCHANGED_SHARE = 0.5
-"""Minimum share of unchanged elements; with fewer, the file counts as rewritten and old lines are
-not shown.
-"""
-FITTED_COMMENT_MARKER = ", fitted to "
-"""Text that marks comments about a cause."""
-_COMMENT = re.compile(r"<!--\s*(.*?)\s*-->")
-_PART = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
-_HEAD = re.compile(r"<(\w+)")
-_NAME = re.compile(r"\bname\s*=\s*[\"']([^\"']*)")
-
-
-def find_model_file_changes(before: str, after: str) -> tuple[ModelFileChange, ...]:
-    """Find the changed lines of a model file, in its order.
-
-    The files are compared element by element. If hardly anything is equal, the file was rewritten
-    (for example from another format): then the elements with a comment are the changes.
-
-    Args:
-        before: Text of the file; empty if there is none of the same format.
-        after: Text of the extended file, where comments precede the elements that they describe.
-    """
-    old_elements, new_elements = _split_into_elements(before), _split_into_elements(after)
-    matcher = SequenceMatcher(None, old_elements, new_elements, autojunk=False)
-    if matcher.ratio() < MIN_UNCHANGED_SHARE:
-        return tuple(_list_commented_elements(new_elements))
-    changes: list[ModelFileChange] = []
-    for kind, old_begin, old_end, new_begin, new_end in matcher.get_opcodes():
-        if kind != "equal":
-            changes += _compare_blocks(
-                old_elements[old_begin:old_end], new_elements[new_begin:new_end]
-            )
-    return tuple(changes)
-
-
-def _split_into_elements(text: str) -> list[str]:
-    """Split the text into tags and comments, whatever the line breaks."""
-    return [" ".join(part.split()) for part in _PART.findall(text)]
-
-
-def _compare_blocks(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFileChange]:
-    """Yield the changes of a block of elements, each with the comments before it.
-
-    With equal counts, each new element replaces the old one at its position. Otherwise the first
-    new element stands for all old ones; a block without new elements was removed.
-
-    Args:
-        old: lines of the block in the user's file, one for each element.
-        new: lines of the block in the extended file, with comments before elements.
-    """
-    elements = list(_pair_with_comments(new))
-    lines_before = list(old)
-    if len(old) != len(elements):
-        # All old elements stand before the first new one.
-        lines_before = ["\n".join(old), *[""] * (len(elements) - 1)]
-    if elements:
-        for line_before, (line, comment) in zip(lines_before, elements, strict=True):
-            yield ModelFileChange(_format_element(line), line_before, line, comment)
-    # The block was removed.
-    elif old:
-        yield ModelFileChange(_format_element(old[0]), "\n".join(old), "")
-
-
-def _list_commented_elements(lines: Sequence[str]) -> Iterator[ModelFileChange]:
-    """Yield the elements with a comment, of a rewritten file."""
-    for line, comment in _pair_with_comments(lines):
-        if comment:
-            yield ModelFileChange(_format_element(line), "", line, comment)
-
-
-def _pair_with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield each XML element (a line) with the comments before it that explain a fitted value.
-
-    Args:
-        lines: tags and comments of the file, one each; a comment precedes its element.
-    """
-    comments: list[str] = []
-    for line in lines:
-        match = _COMMENT.fullmatch(line)
-        if match is None:
-            yield line, "; ".join(comments)
-            comments = []
-        # Other comments, such as one on the whole file, do not describe the next element.
-        elif FITTED_COMMENT_MARKER in match[1]:
-            comments.append(match[1])
-
-
-def _format_element(line: str) -> str:
-    """Format the element of a line of XML, such as ``joint elbow``."""
-    head, name = _HEAD.search(line), _NAME.search(line)
-    return " ".join(match[1] for match in (head, name) if match)

@@ -27,27 +27,25 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import BaseFit, fit_base_model
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
+from bench.diagnosis.fitting.trajectory_derivatives import (
+    CandidateDirection,
+    compute_central_jacobian,
+)
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.search.diagnose import find_unidentified_parameters
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.validation.confidence_intervals import (
-    Z95,
-    compute_central_jacobian,
-    invert_scaled,
-)
+from bench.diagnosis.validation.confidence_intervals import Z95, invert_scaled
 from bench.logs.filter_settling import leave_out_settling
 from bench.logs.recording_loading import load_recording
 from bench.logs.segmentation import segment_recording
 from sims.core.effect import ALL_PLACES
-from sims.core.plain_values import format_unit, join_first_names
 from sims.core.simulator import Array, InputError, Parameter
 from sims.recording.recording import Recording
 from sims.system_simulator import SystemSimulator
@@ -66,8 +64,6 @@ CONFOUNDING_CORRELATION = 0.95
 """Minimum correlation of two parameters that are reported as confounded."""
 CANDIDATES_PER_BLOCK = 256
 """Number of candidates that are projected together, which limits the memory."""
-MAX_LISTED_CAUSES = 8
-"""Maximum number of causes with their own line, and of names in a list, in the terminal."""
 MAX_NAMED_CONFOUNDERS = 4
 """Maximum number of confounded parameters that are reported for one parameter."""
 
@@ -381,77 +377,6 @@ def _classify_parameter(
     )
 
 
-def format_identifiability(assessments: Sequence[ParameterIdentifiability]) -> list[str]:
-    """Format the free parameters and the best identifiable causes as lines for the terminal.
-
-    Args:
-        assessments: identifiability of each free parameter, then of each cause, best first.
-    """
-    lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
-    lines += [f"  {_format_parameter(number)}" for number in assessments if number.free]
-    causes = {level: [n for n in assessments if not n.free and n.word == level] for level in _WORDS}
-    counts = [f"{len(members)} {level}" for level, members in causes.items()]
-    lines.append(f"causes, each considered alone, smallest uncertainty first: {', '.join(counts)}")
-    # A limit has no interval, and follows the causes that have one.
-    identifiable = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
-    lines += [f"  {_format_parameter(number)}" for number in identifiable[:MAX_LISTED_CAUSES]]
-    # The other causes are named only.
-    other_causes = {
-        "also identifiable": identifiable[MAX_LISTED_CAUSES:],
-        "weak": causes["weak"],
-        "not identifiable": causes["not identifiable"],
-    }
-    for level, members in other_causes.items():
-        if members:
-            names = join_first_names(_count_effects(members), MAX_LISTED_CAUSES)
-            lines.append(f"  {level}: {names}")
-    if any(len(members) > MAX_LISTED_CAUSES for members in causes.values()):
-        lines.append("  all causes with their intervals: the same command with --json")
-    return lines
-
-
-def _format_parameter(number: ParameterIdentifiability) -> str:
-    """Format one parameter with its level, interval, range and confounded parameters.
-
-    A limit or backlash has no interval (NaN), and a parameter without influence an infinite one.
-
-    Args:
-        number: identifiability of a parameter, or of a coefficient of a cause.
-    """
-    if np.isfinite(number.half):
-        interval_text = f"±{number.half:.2g} {format_unit(number.unit)}".rstrip()
-    elif np.isnan(number.half):
-        interval_text = "a limit inside the range of the data"
-    else:
-        interval_text = "no influence"
-    confounder_text = join_first_names([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
-    confounding_note = f"; confounded with {confounder_text}" if confounder_text else ""
-    span = f"{number.low:.3g} to {number.high:.3g}"
-    return (
-        f"{number.word:16s} {number.name}: {interval_text} (plausible range "
-        f"{span}){confounding_note}"
-    )
-
-
-def _count_effects(assessments: Sequence[ParameterIdentifiability]) -> list[str]:
-    """List the effects of causes once each, with the number of their places if there are several.
-
-    The name of a cause is that of its effect with its place, and of its coefficient after a space.
-    """
-    places: dict[str, set[str]] = {}
-    for number in assessments:
-        placed_effect, _, _ = number.name.partition(" ")
-        effect, _, place = placed_effect.partition("@")
-        places.setdefault(effect, set()).add(place)
-    return [
-        f"{effect} ({len(effect_places)} places)" if len(effect_places) > 1 else effect
-        for effect, effect_places in places.items()
-    ]
-
-
-_WORDS: tuple[IdentifiabilityLevel, ...] = ("identifiable", "weak", "not identifiable")
-
-
 def _share_of_range(number: ParameterIdentifiability) -> float:
     """Return half the width of an interval as a fraction of the plausible range."""
     width = number.high - number.low
@@ -549,3 +474,28 @@ def check_identifiability(
         numbers = assess_identifiability(evaluator, noise, fit_with_derivatives)
         evaluator.close()
     return numbers
+
+
+def assess_identifiability_after_search(
+    search: EffectSearch,
+) -> tuple[ParameterIdentifiability, ...]:
+    """Assess identifiability from the responses of the runs to effects (directions).
+
+    The search has computed them about the base model, on their own or together with scores. If it
+    has not, the result is empty. This is the last step that uses the search, so its memory is
+    released first.
+
+    Args:
+        search: the finished search.
+    """
+    search.release_memory()
+    directions = search.get_known_directions()
+    if directions is None:
+        # Scans are scores with their directions, by the effects of the model; the base model has no
+        # effects. That of an earlier fit is used if a better fit has replaced it without a scan.
+        key: frozenset[str] = frozenset()
+        scan = search.cached_scans.get(key) or search.superseded_scans.get(key)
+        if scan is None:
+            return ()
+        directions = scan.fit, scan.directions
+    return assess_identifiability(search.evaluator, search.noise, *directions)

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.extended_robot_files import make_option_value
 from bench.diagnosis.search.verdict_rules import VerdictName
 from bench.diagnosis.verdict import Cause, Verdict
 from sims.extended_simulator import FittedValue
+from sims.robot.fitted_causes import make_option_value
 
 if TYPE_CHECKING:
     from bench.diagnosis.evaluation.discretisation_error import StepRefinement

@@ -10,11 +10,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.diagnosis.extended_robot_files import collect_causes
 from bench.diagnosis.verdict import Verdict
 from bench.pages.text_format import joined
-from sims.core.plain_values import append_unit
+from sims.core.user_messages import append_unit
 from sims.extended_simulator import ExtendedSimulator, FittedValue
+from sims.robot.fitted_causes import collect_causes
 
 if TYPE_CHECKING:
     from sims.robot.fitted_causes import FittedCause

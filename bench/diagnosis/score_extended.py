@@ -21,7 +21,7 @@ from bench.diagnosis.validation.held_out_runs import HeldOutRuns
 from bench.logs.filter_settling import leave_out_settling
 from bench.logs.lost_samples import fill_lost_commands
 from bench.logs.quality.log_quality import check_recording_plausible
-from bench.logs.recording_loading import check_value_sizes
+from bench.logs.quality.range_checks import check_value_sizes
 from sims.core.simulator import Array, InputError, make_unknown_name_error
 from sims.extended_simulator import ExtendedSimulator, open_extended, read_extended
 from sims.recording.recording import Recording, read_recording, read_system_name

@@ -5,8 +5,10 @@ The fields of each class are the keys of its entry in verdict.json, in this orde
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -20,8 +22,14 @@ from bench.diagnosis.search.verdict_rules import (
     VERDICT_MEANINGS,
     VerdictName,
 )
-from sims.core.document_fields import OPTIONAL, Document
+from bench.schemas import find_violations
+from sims.core.files import get_first_line
+from sims.core.json_documents import OPTIONAL, Document
+from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue
+
+VERDICT_FILE = "verdict.json"
+"""File of the verdict in the folder of an explanation."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -238,3 +246,39 @@ def _format_value(number: FittedValue) -> str:
 
 def _format_number(value: float | None) -> str:
     return "?" if value is None else f"{value:.3g}"
+
+
+class InvalidVerdictError(InputError):
+    """Error of a verdict that cannot be read.
+
+    Attributes:
+        violations: what is wrong with it, one line each.
+    """
+
+    def __init__(self, message: str, violations: Sequence[str]) -> None:
+        super().__init__(message)
+        self.violations = violations
+
+
+def read_verdict(folder: Path) -> Verdict:
+    """Read the verdict of an explanation.
+
+    Raises:
+        InvalidVerdictError: it is missing, or violates its JSON schema.
+    """
+    path = folder / VERDICT_FILE
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        violations = find_violations(document, "verdict")
+        if not violations:
+            return Verdict.from_document(document)
+    except OSError as error:
+        remedy = "name a folder that simgap explain has written"
+        raise InvalidVerdictError(
+            f"{path}: cannot be read ({error.strerror}); {remedy}", [get_first_line(error)]
+        ) from None
+    except (ValueError, RecursionError, KeyError, TypeError) as error:
+        violations = [get_first_line(error)]
+    raise InvalidVerdictError(
+        f"{path}: expected a verdict of simgap explain; {violations[0]}", violations
+    )

@@ -6,59 +6,30 @@ the recording's files through a pipe, and nothing else.
 
 from __future__ import annotations
 
-import json
-import tempfile
-import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from bench.benchmark.isolation.message_channel import (
-    MessageKind,
-    ProtocolError,
-    pack_arrays,
-)
 from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.isolation.tuner_processes import (
-    START_TIMEOUT_SECONDS,
-    IsolatedProcess,
     TunerSpec,
 )
 from bench.benchmark.runner.retry_after_kill import retry_if_killed
 from bench.benchmark.runner.trained_weights import read_weights
-from bench.benchmark.runner.tuner_process_reuse import start_part_process
-from bench.core.diagnoser import Answer
 from bench.core.random_streams import make_seed_words
-from bench.diagnosis_benchmark import diagnoser_process
-from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
 from bench.diagnosis_benchmark.case_set import CaseSpec, render_recording
-from sims.core.simulator import Array, InputError
+from bench.diagnosis_benchmark.diagnoser_process import (
+    AnswerLimits,
+    diagnose_in_process,
+    diagnose_isolated,
+)
+from sims.core.simulator import InputError
 
-PRELOAD_MODULE = "bench.diagnosis_benchmark.preload"
-"""Module that is preloaded in the fork server."""
-_MAX_ANSWER_BYTES = 1 << 20
-"""Maximum size of an answer, bytes."""
-_MAX_REASON_LENGTH = 200
-"""Maximum length of the reason why a diagnoser does not support a case, characters."""
 BUDGET_EXCEEDED_REASON = "it asked for more simulations than are allowed"
 """Reason of a missing answer when the diagnoser exceeded its simulation budget."""
-
-
-@dataclass(frozen=True)
-class AnswerLimits:
-    """Limits of one answer.
-
-    Attributes:
-        simulations: maximum number of simulations with simgap's simulators.
-        seconds: maximum elapsed time.
-        memory: maximum memory, MiB; 0 for no limit.
-    """
-
-    simulations: int
-    seconds: float
-    memory: int = 0
 
 
 @dataclass(frozen=True)
@@ -160,10 +131,10 @@ def _ask_diagnoser(
     started_at = perf_counter()
     try:
         if diagnoser.trusted:
-            answer = _diagnose_in_process(request, trained_arrays)
+            answer = diagnose_in_process(request, trained_arrays)
         else:
             answer = retry_if_killed(
-                lambda: _diagnose_isolated(diagnoser.code, request, trained_arrays, limits, hidden)
+                lambda: diagnose_isolated(diagnoser.code, request, trained_arrays, limits, hidden)
             )
         skipped = answer.pop("skipped", "")
         outcome = {"status": "skipped" if skipped else "done", "reason": skipped, **answer}
@@ -187,131 +158,38 @@ def _format_failure_reason(text: str) -> str:
     return text
 
 
-def _diagnose_in_process(
-    request: dict[str, Any], trained_arrays: Mapping[str, Array]
+def make_failed_answers(
+    question: CaseSpec, labels: Sequence[str], error: BaseException
 ) -> dict[str, Any]:
-    """Run a trusted diagnoser in this process.
+    """Make failed answers for a case whose worker died or exceeded its time limit.
 
     Args:
-        request: the case and its files, as the process of a diagnoser receives them.
-        trained_arrays: arrays of a learned diagnoser, by name.
+        question: specification of a case: system, hidden cause, size and seed.
+        labels: labels of the diagnosers.
+        error: error of the worker.
 
     Returns:
-        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
-        diagnoser does not support the simulator.
+        Document as `evaluate_case` returns it: name of the case (``question``), the case
+        (``item``), of which only the name is known, and one row per diagnoser.
 
     Raises:
-        RunEndedError: the diagnoser failed.
+        InputError: `error` is one: a wrong input stops the study.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            return diagnoser_process.diagnose_case(request, Path(folder), trained_arrays)
-        except Exception:
-            traceback.print_exc()
-            raise RunEndedError("crashed", traceback.format_exc()) from None
-
-
-def _diagnose_isolated(
-    code: TunerSpec,
-    request: dict[str, Any],
-    trained_arrays: Mapping[str, Array],
-    limits: AnswerLimits,
-    hidden: tuple[str, ...],
-) -> dict[str, Any]:
-    """Run a diagnoser in an isolated process and validate its answer.
-
-    The process ends after this answer, so that nothing passes from one case to the next. Its
-    messages have a kind of one letter: L sends the trained arrays, Q the case, and A is the answer.
-    The time limit begins with the case; starting the process and loading the arrays do not count.
-
-    Args:
-        code: where the code of the diagnoser is.
-        request: request with the texts of the recording.
-        trained_arrays: trained arrays; empty if the diagnoser needs no training.
-        limits: limits of the answer.
-        hidden: folders that the diagnoser may not read.
-
-    Returns:
-        Answer, number of simulations, processor time and elapsed seconds; or the reason in
-        ``skipped`` if the diagnoser does not support the simulator.
-
-    Raises:
-        RunEndedError: the diagnoser failed.
-    """
-    # Only the recording of a robot has further files: its model file.
-    extra_modules = ("mujoco",) if request["beside"] else ()
-    child = start_diagnoser_process(code, limits.memory, hidden, extra_modules)
-    try:
-        if trained_arrays:
-            deadline = perf_counter() + START_TIMEOUT_SECONDS
-            child.send(MessageKind.WEIGHTS, *pack_arrays(trained_arrays), deadline=deadline)
-            child.receive(deadline=deadline)  # the process confirms that it has the arrays
-        started_at = perf_counter()
-        deadline = started_at + limits.seconds
-        child.send(MessageKind.QUESTION, json.dumps(request).encode(), deadline=deadline)
-        message = child.receive(_MAX_ANSWER_BYTES, deadline)
-        seconds = perf_counter() - started_at
-        try:
-            if message.kind != MessageKind.ANSWER:
-                raise ProtocolError("it gave no answer")
-            answer = _validate_answer(message.to_document(_MAX_ANSWER_BYTES), limits)
-        except (ProtocolError, InputError, KeyError, TypeError, ValueError) as error:
-            raise child.fail_with_protocol_error(f"{error}"[:500]) from None
-        return {**answer, "seconds": seconds}
-    finally:
-        child.end()
-
-
-def _validate_answer(message: Any, limits: AnswerLimits) -> dict[str, Any]:
-    """Validate the message of an isolated diagnoser, which may be malicious.
-
-    Args:
-        message: document that the process of the diagnoser sent.
-        limits: limits of the answer, which the reported costs cannot exceed.
-
-    Returns:
-        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
-        diagnoser does not support the simulator.
-
-    Raises:
-        ProtocolError: the reported costs are impossible.
-    """
-    simulations, seconds = int(message["simulations"]), float(message["processor_seconds"])
-    # A billion seconds are 32 years; NaN is refused, too.
-    if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
-        raise ProtocolError("it reported an impossible number of simulations")
-    if skipped := str(message.get("skipped", ""))[:_MAX_REASON_LENGTH]:
-        empty_answer = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
-        return {**empty_answer, "skipped": skipped}
-    answer = Answer.of(message["answer"]).document()
-    return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
-
-
-def start_diagnoser_process(
-    code: TunerSpec, memory: int, hidden: tuple[str, ...], extra_modules: tuple[str, ...] = ()
-) -> IsolatedProcess:
-    """Start the isolated process of a diagnoser from the fork server, and wait until it is ready.
-
-    Args:
-        code: where the code of the diagnoser is.
-        memory: maximum memory, MiB; 0 for no limit.
-        hidden: folders that the process must not read.
-        extra_modules: further modules that the fork server loads first, such as MuJoCo for robots.
-
-    Returns:
-        The process; the caller ends it.
-    """
-    child = start_part_process(
-        code,
-        "bench.diagnosis_benchmark.diagnoser_process:serve_requests",
-        memory,
-        hidden,
-        # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
-        [PRELOAD_MODULE, *extra_modules],
-    )
-    try:
-        child.wait_until_ready()
-    except BaseException:
-        child.end()
-        raise
-    return child
+    if isinstance(error, InputError):
+        raise error
+    status = "timeout" if isinstance(error, TimeoutError) else "crashed"
+    rows = [
+        {
+            "question": question.name,
+            "diagnoser": label,
+            "status": status,
+            "reason": str(error),
+            "answer": None,
+            "simulations": 0,
+            "processor_seconds": None,
+            "seconds": None,
+            "trusted": False,
+        }
+        for label in labels
+    ]
+    return {"question": question.name, "item": {"name": question.name}, "rows": rows}

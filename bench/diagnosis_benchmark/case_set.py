@@ -14,26 +14,26 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.core.random_streams import PUBLIC_SALT, make_rng
 from bench.diagnosis_benchmark.case_generation import case_sampling
-from bench.diagnosis_benchmark.case_generation.recording_conditions import (
-    ANY_CONDITIONS,
+from bench.diagnosis_benchmark.case_generation.benchmark_case import (
     CASE_KINDS,
-    NOISE_KINDS,
     BenchmarkCase,
-    RequestedConditions,
     name_case,
 )
-from bench.diagnosis_benchmark.case_generation.reference_simulation import (
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    ANY_CONDITIONS,
+    NOISE_KINDS,
     SIMULATORS,
-    UNMODELLED_CAUSES,
+    RequestedConditions,
 )
-from bench.diagnosis_benchmark.machine_cases import hidden_causes
+from bench.diagnosis_benchmark.case_generation.reference_simulation import UNMODELLED_CAUSES
 from bench.diagnosis_benchmark.machine_cases import machine_case_sampling as machines
+from bench.diagnosis_benchmark.machine_cases import machine_effect_coefficients
 from sims import effects as library
-from sims.core.document_fields import Document
 from sims.core.files import Content, write_files
+from sims.core.json_documents import Document
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
     check_entries,
@@ -42,7 +42,6 @@ from sims.core.toml_validation import (
     make_error,
 )
 from sims.recording.recording_writer import format_description, format_table
-from sims.systems.servo import Servo
 
 ALL_SYSTEMS = (*case_sampling.SYSTEMS, *machines.MACHINE_NAMES)
 """Names of all systems."""
@@ -93,14 +92,14 @@ def draw_case(
 def list_hideable_effects(system: str) -> list[str]:
     """List the effects of the library that can be hidden in a system."""
     if system in machines.MACHINE_NAMES:
-        return list(hidden_causes.EFFECTS_BY_MACHINE[system])
+        return list(machine_effect_coefficients.EFFECTS_BY_MACHINE[system])
     return sorted(library.list_effects_for(SIMULATORS[system].system))
 
 
 def list_unmodelled_causes(system: str) -> list[str]:
     """List the causes for a system that the library does not contain."""
     return list(
-        hidden_causes.UNMODELLED_CAUSES
+        machine_effect_coefficients.UNMODELLED_CAUSES
         if system in machines.MACHINE_NAMES
         else UNMODELLED_CAUSES[system]
     )
@@ -111,24 +110,6 @@ def find_equivalent_effects(case: BenchmarkCase, effect: str) -> frozenset[str]:
     if case.system in machines.MACHINE_NAMES:
         return machines.find_equivalent_causes(case.system, effect)
     return case_sampling.find_equivalent_effects(case.system, case.driven, effect)
-
-
-def list_coefficient_names(system: str, name: str) -> list[str]:
-    """List the names of an effect's coefficients, in the order of the numbers in a case.
-
-    They may depend on the system, as the number of directions does; those of the robot arm arm2
-    do not.
-
-    Args:
-        system: name of the system, such as ``pendulum``.
-        name: name of the effect, with or without a place, as ``friction.coulomb@elbow``.
-    """
-    effect = library.get_effect(name.partition("@")[0])
-    if system == "arm2":
-        return [coefficient.name for coefficient in effect.coefficients]
-    system_model = Servo.system if system == "servo" else SIMULATORS[system].system
-    # `on` gives the coefficients that the effect has on this system.
-    return [coefficient.name for coefficient in effect.on(system_model)]
 
 
 def render_recording(case: BenchmarkCase) -> RecordingFiles:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.diagnosis_benchmark.result_tables import (
     P_VALUE_LEVELS,
     PRIMARY_METRIC,
@@ -23,17 +23,19 @@ from bench.diagnosis_benchmark.result_tables import (
     select_graded_answers,
     select_single_effects,
 )
-from bench.figures import style
+from bench.figures import figure_layout, style
+from bench.figures.figure_layout import add_trust_note
 from bench.figures.figure_output import FigureFiles, render_all_formats
-from bench.figures.style import (
-    GREY,
-    MarkStyle,
-    add_trust_note,
-    get_mark_style,
-    make_mark_style,
+from bench.figures.style import GREY, MarkStyle, get_mark_style, make_mark_style
+from bench.pages.chart import (
+    Axis,
+    Panel,
+    ReferenceLine,
+    Series,
+    draw_chart,
+    finish_chart,
+    make_method_series,
 )
-from bench.pages.chart import Axis, Panel, ReferenceLine, Series, make_method_series
-from bench.pages.chart_figure import draw_chart, finish_chart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -385,7 +387,7 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
         title: title of the figure.
     """
     # Width and height in inches, with the space for each diagnoser.
-    figure, axes = style.make_panel_grid(1, 1, (8.6, 0.5 * len(order) + 2.2))
+    figure, axes = figure_layout.make_panel_grid(1, 1, (8.6, 0.5 * len(order) + 2.2))
     axis: Axes = axes[0][0]
     styles = {outcome: (colour, label) for outcome, colour, label in OUTCOME_STYLES}
     counts = pd.crosstab(rows["diagnoser"], rows["outcome"]).reindex(
@@ -419,11 +421,13 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
     axis.invert_yaxis()
     axis.set_xlim(0, 100)
     axis.set_xlabel("recordings with one hidden effect of at least one noise [%]")
-    style.style_axis(axis)
+    figure_layout.style_axis(axis)
     axis.grid(visible=False)
     axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8.5)
     figure.suptitle(title, fontsize=11)
-    style.add_caption(figure, f"{total} recordings; numbers in bars count them.", letters=16)
+    figure_layout.add_caption(
+        figure, f"{total} recordings; numbers in bars count them.", letters=16
+    )
     return figure
 
 
@@ -464,7 +468,9 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
         1.6 + column_count * max(2.2, 0.16 * len(answer_labels)),
         1.4 + row_count * max(1.4, 0.17 * len(hidden)),
     )
-    figure, axes = style.make_panel_grid(row_count, column_count, size, sharex=True, sharey=True)
+    figure, axes = figure_layout.make_panel_grid(
+        row_count, column_count, size, sharex=True, sharey=True
+    )
     for panel_index, axis in enumerate(axes.flat):
         if panel_index >= len(order):  # the last row of panels is not full
             axis.set_axis_off()
@@ -477,7 +483,7 @@ def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str
     figure.suptitle(title, fontsize=11)
     figure.supylabel("hidden", fontsize=9)
     cases = graded_rows.drop_duplicates("question")
-    style.add_caption(
+    figure_layout.add_caption(
         figure,
         f"{len(cases)} recordings with nothing hidden, one effect of at least one noise or a "
         "foreign cause. Per cent of a row. Black frames: right. A cause that is found alone or in "

@@ -8,11 +8,15 @@ obtain the true causes, because no process of a diagnoser ever contains them.
 from __future__ import annotations
 
 import inspect
+import json
+import tempfile
 import time
 import traceback
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -24,10 +28,18 @@ from bench.benchmark.isolation.message_channel import (
     MessageChannel,
     MessageKind,
     PeerClosedError,
+    ProtocolError,
     pack_arrays,
     unpack_arrays,
 )
+from bench.benchmark.isolation.process_errors import RunEndedError
+from bench.benchmark.isolation.tuner_processes import (
+    START_TIMEOUT_SECONDS,
+    IsolatedProcess,
+    TunerSpec,
+)
 from bench.benchmark.isolation.tuner_server import load_class
+from bench.benchmark.runner.tuner_process_start import start_part_process
 from bench.core.diagnoser import (
     Answer,
     Diagnoser,
@@ -39,12 +51,21 @@ from bench.core.plugin_registries import simulators
 from bench.logs.recording_loading import get_simulator_class
 from sims import effects
 from sims.core.simulation_counter import SIMULATION_COUNTER
-from sims.core.simulator import Array
+from sims.core.simulator import Array, InputError
 from sims.recording.recording import read_recording
 from sims.system_simulator import SystemSimulator
 
 _MAX_DOCUMENT_BYTES = 1 << 30
 """Maximum size in bytes of a case document."""
+
+PRELOAD_MODULE = "bench.diagnosis_benchmark.preload"
+"""Module that is preloaded in the fork server."""
+
+_MAX_ANSWER_BYTES = 1 << 20
+"""Maximum size of an answer, bytes."""
+
+_MAX_REASON_LENGTH = 200
+"""Maximum length of the reason why a diagnoser does not support a case, characters."""
 
 
 def serve_requests(
@@ -200,3 +221,148 @@ def train_diagnoser(request: Mapping[str, Any]) -> tuple[Mapping[str, Array], in
         return {name: np.asarray(array) for name, array in arrays.items()}, SIMULATION_COUNTER.used
     finally:
         SIMULATION_COUNTER.reset()
+
+
+@dataclass(frozen=True)
+class AnswerLimits:
+    """Limits of one answer.
+
+    Attributes:
+        simulations: maximum number of simulations with simgap's simulators.
+        seconds: maximum elapsed time.
+        memory: maximum memory, MiB; 0 for no limit.
+    """
+
+    simulations: int
+    seconds: float
+    memory: int = 0
+
+
+def diagnose_in_process(
+    request: dict[str, Any], trained_arrays: Mapping[str, Array]
+) -> dict[str, Any]:
+    """Run a trusted diagnoser in this process.
+
+    Args:
+        request: the case and its files, as the process of a diagnoser receives them.
+        trained_arrays: arrays of a learned diagnoser, by name.
+
+    Returns:
+        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
+        diagnoser does not support the simulator.
+
+    Raises:
+        RunEndedError: the diagnoser failed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return diagnose_case(request, Path(folder), trained_arrays)
+        except Exception:
+            traceback.print_exc()
+            raise RunEndedError("crashed", traceback.format_exc()) from None
+
+
+def diagnose_isolated(
+    code: TunerSpec,
+    request: dict[str, Any],
+    trained_arrays: Mapping[str, Array],
+    limits: AnswerLimits,
+    hidden: tuple[str, ...],
+) -> dict[str, Any]:
+    """Run a diagnoser in an isolated process and validate its answer.
+
+    The process ends after this answer, so that nothing passes from one case to the next. Its
+    messages have a kind of one letter: L sends the trained arrays, Q the case, and A is the answer.
+    The time limit begins with the case; starting the process and loading the arrays do not count.
+
+    Args:
+        code: where the code of the diagnoser is.
+        request: request with the texts of the recording.
+        trained_arrays: trained arrays; empty if the diagnoser needs no training.
+        limits: limits of the answer.
+        hidden: folders that the diagnoser may not read.
+
+    Returns:
+        Answer, number of simulations, processor time and elapsed seconds; or the reason in
+        ``skipped`` if the diagnoser does not support the simulator.
+
+    Raises:
+        RunEndedError: the diagnoser failed.
+    """
+    # Only the recording of a robot has further files: its model file.
+    extra_modules = ("mujoco",) if request["beside"] else ()
+    child = start_diagnoser_process(code, limits.memory, hidden, extra_modules)
+    try:
+        if trained_arrays:
+            deadline = perf_counter() + START_TIMEOUT_SECONDS
+            child.send(MessageKind.WEIGHTS, *pack_arrays(trained_arrays), deadline=deadline)
+            child.receive(deadline=deadline)  # the process confirms that it has the arrays
+        started_at = perf_counter()
+        deadline = started_at + limits.seconds
+        child.send(MessageKind.QUESTION, json.dumps(request).encode(), deadline=deadline)
+        message = child.receive(_MAX_ANSWER_BYTES, deadline)
+        seconds = perf_counter() - started_at
+        try:
+            if message.kind != MessageKind.ANSWER:
+                raise ProtocolError("it gave no answer")
+            answer = _validate_answer(message.to_document(_MAX_ANSWER_BYTES), limits)
+        except (ProtocolError, InputError, KeyError, TypeError, ValueError) as error:
+            raise child.fail_with_protocol_error(f"{error}"[:500]) from None
+        return {**answer, "seconds": seconds}
+    finally:
+        child.end()
+
+
+def _validate_answer(message: Any, limits: AnswerLimits) -> dict[str, Any]:
+    """Validate the message of an isolated diagnoser, which may be malicious.
+
+    Args:
+        message: document that the process of the diagnoser sent.
+        limits: limits of the answer, which the reported costs cannot exceed.
+
+    Returns:
+        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
+        diagnoser does not support the simulator.
+
+    Raises:
+        ProtocolError: the reported costs are impossible.
+    """
+    simulations, seconds = int(message["simulations"]), float(message["processor_seconds"])
+    # A billion seconds are 32 years; NaN is refused, too.
+    if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
+        raise ProtocolError("it reported an impossible number of simulations")
+    if skipped := str(message.get("skipped", ""))[:_MAX_REASON_LENGTH]:
+        empty_answer = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
+        return {**empty_answer, "skipped": skipped}
+    answer = Answer.of(message["answer"]).document()
+    return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
+
+
+def start_diagnoser_process(
+    code: TunerSpec, memory: int, hidden: tuple[str, ...], extra_modules: tuple[str, ...] = ()
+) -> IsolatedProcess:
+    """Start the isolated process of a diagnoser from the fork server, and wait until it is ready.
+
+    Args:
+        code: where the code of the diagnoser is.
+        memory: maximum memory, MiB; 0 for no limit.
+        hidden: folders that the process must not read.
+        extra_modules: further modules that the fork server loads first, such as MuJoCo for robots.
+
+    Returns:
+        The process; the caller ends it.
+    """
+    child = start_part_process(
+        code,
+        "bench.diagnosis_benchmark.diagnoser_process:serve_requests",
+        memory,
+        hidden,
+        # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
+        [PRELOAD_MODULE, *extra_modules],
+    )
+    try:
+        child.wait_until_ready()
+    except BaseException:
+        child.end()
+        raise
+    return child

@@ -7,22 +7,18 @@ from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
 from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.isolation.tuner_processes import TunerSpec
-from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.runner.code_digest import hash_class_source
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.runner.experiment_runner import ProgressFactory, no_progress
-from bench.benchmark.runner.plugin_discovery import (
-    announce_installed,
-    check_classes_importable,
-    list_compared_parts,
-)
+from bench.benchmark.runner.plugin_inspection import announce_installed, check_classes_importable
+from bench.benchmark.runner.run_fingerprint import hash_class_source, list_compared_parts
 from bench.benchmark.runner.study_base import PreparedStudy, PrintLine, Study
 from bench.benchmark.runner.trained_weights import TrainingResult, get_weights_folder
-from bench.benchmark.runner.tuner_process_reuse import make_part_spec
+from bench.benchmark.runner.tuner_process_start import make_part_spec
 from bench.benchmark.runner.worker_pools import Call, Pool, make_pool
 from bench.benchmark.storage.run_status import (
     MISSING_STATUS,
@@ -33,9 +29,9 @@ from bench.core.plugin_registries import PartUnavailableError, diagnosers, simul
 from bench.core.random_streams import PUBLIC_SALT, make_rng
 from bench.diagnosis_benchmark.answer_store import AnswersByCase, AnswerStore, read_answers
 from bench.diagnosis_benchmark.case_evaluation import (
-    AnswerLimits,
     EvaluatedDiagnoser,
     evaluate_case,
+    make_failed_answers,
 )
 from bench.diagnosis_benchmark.case_set import (
     BenchmarkConfig,
@@ -43,6 +39,7 @@ from bench.diagnosis_benchmark.case_set import (
     build_case_set,
     read_config,
 )
+from bench.diagnosis_benchmark.diagnoser_process import AnswerLimits
 from bench.diagnosis_benchmark.diagnoser_training import (
     TrainingCost,
     train_or_load,
@@ -387,46 +384,9 @@ class _EvaluationRun:
         )
         for index, result in workers.iterate_results(calls, max_seconds):
             if isinstance(result, BaseException):
-                result = _make_failed_answers(questions[index], names_by_call[index], result)
+                result = make_failed_answers(questions[index], names_by_call[index], result)
             self._answer_store.append(result)
             step()
-
-
-def _make_failed_answers(
-    question: CaseSpec, labels: Sequence[str], error: BaseException
-) -> dict[str, Any]:
-    """Make failed answers for a case whose worker died or exceeded its time limit.
-
-    Args:
-        question: specification of a case: system, hidden cause, size and seed.
-        labels: labels of the diagnosers.
-        error: error of the worker.
-
-    Returns:
-        Document as `evaluate_case` returns it: name of the case (``question``), the case
-        (``item``), of which only the name is known, and one row per diagnoser.
-
-    Raises:
-        InputError: `error` is one: a wrong input stops the study.
-    """
-    if isinstance(error, InputError):
-        raise error
-    status = "timeout" if isinstance(error, TimeoutError) else "crashed"
-    rows = [
-        {
-            "question": question.name,
-            "diagnoser": label,
-            "status": status,
-            "reason": str(error),
-            "answer": None,
-            "simulations": 0,
-            "processor_seconds": None,
-            "seconds": None,
-            "trusted": False,
-        }
-        for label in labels
-    ]
-    return {"question": question.name, "item": {"name": question.name}, "rows": rows}
 
 
 def _check_code_isolated(experiment: Experiment) -> None:

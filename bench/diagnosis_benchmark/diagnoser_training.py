@@ -21,12 +21,12 @@ from bench.benchmark.isolation.message_channel import (
     unpack_arrays,
 )
 from bench.benchmark.isolation.tuner_processes import TunerSpec
-from bench.benchmark.runner.code_digest import (
+from bench.benchmark.runner.retry_after_kill import retry_if_killed
+from bench.benchmark.runner.run_fingerprint import (
     compute_digest,
     hash_package_versions,
     hash_source_folders,
 )
-from bench.benchmark.runner.retry_after_kill import retry_if_killed
 from bench.benchmark.runner.trained_weights import (
     TrainingResult,
     WeightsError,
@@ -36,7 +36,7 @@ from bench.benchmark.runner.trained_weights import (
 )
 from bench.core.random_streams import make_seed_words
 from bench.diagnosis_benchmark import diagnoser_process
-from bench.diagnosis_benchmark.case_evaluation import start_diagnoser_process
+from bench.diagnosis_benchmark.diagnoser_process import start_diagnoser_process
 from sims.core.files import write_atomically
 from sims.core.simulator import Array
 

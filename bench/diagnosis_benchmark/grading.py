@@ -24,8 +24,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
-from bench.diagnosis_benchmark.case_set import find_equivalent_effects, list_coefficient_names
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.effect_coefficients import list_coefficient_names
+from bench.diagnosis_benchmark.case_set import find_equivalent_effects
 
 NamedSets = list[tuple[str, ...]]
 CoverageCheck = Callable[[str, tuple[str, ...]], bool]

@@ -21,7 +21,7 @@ from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.search.candidate_directions import compute_directions
 from bench.diagnosis_benchmark.case_generation.case_sampling import SYSTEMS
 from bench.logs.synthetic_recording import SimulationSpec, simulate_recording
-from sims.engines.compiled import kernel
+from sims.engines.compiled import element_stepping
 from sims.system_simulator import SystemSimulator
 
 _NOISE_SIGMA = 1e-3
@@ -51,6 +51,6 @@ def _warm_up_search(system: str) -> None:
         compute_directions(evaluator, fit_base_model(evaluator, noise).fit, evaluator.library)
 
 
-kernel.COMPILED.load()
+element_stepping.COMPILED.load()
 for _system in SYSTEMS:
     _warm_up_search(_system)

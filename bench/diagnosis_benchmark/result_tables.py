@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.statistics.paired_tests import correct_holm
+from bench.benchmark.statistics.paired_tests import compute_mcnemar_p_value, correct_holm
 from bench.benchmark.statistics.proportion_interval import compute_proportion_interval
 from bench.benchmark.storage.csv_reader import CsvTable
 from bench.benchmark.storage.table_schemas import Columns, ColumnSpec, EmptyCellRule
 from bench.diagnosis_benchmark.answer_store import AnswersByCase
-from bench.diagnosis_benchmark.case_generation.recording_conditions import CASE_KINDS, BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.benchmark_case import CASE_KINDS, BenchmarkCase
 from bench.diagnosis_benchmark.grading import grade_answer
 
 MIN_GRADED_SIZE = 1.0
@@ -409,23 +409,6 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
         lambda p_values: correct_holm(p_values.to_numpy())
     )
     return frame
-
-
-def compute_mcnemar_p_value(first_only: int, second_only: int) -> float:
-    """Compute the p-value of McNemar's exact test, two-sided: are two diagnosers equally good?
-
-    If they are, each case that only one of them answered correctly is as likely to be the first
-    one's as the second one's. Without such cases the p-value is 1.
-
-    Args:
-        first_only: number of cases that only the first diagnoser answered correctly.
-        second_only: number of cases that only the second diagnoser answered correctly.
-    """
-    from scipy.stats import binomtest
-
-    if first_only + second_only:
-        return float(binomtest(first_only, first_only + second_only).pvalue)
-    return 1.0
 
 
 def index_by_diagnoser(frame: pd.DataFrame, metric: str = "") -> dict[str, TableRow]:

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.figure_output import render_png_and_pdf
-from bench.figures.style import BLUE, RECORDED_PART_GREY, RUST, make_panel_grid
-from bench.logs.ball_heights import BallHeights
+from bench.figures.style import BLUE, RECORDED_PART_GREY, RUST
+from bench.logs.ball_heights_from_film import BallHeights
 from sims.core.simulator import Array
 from sims.vision.ball_renderer import RgbImage
 from sims.vision.ball_tracker import BallTrack

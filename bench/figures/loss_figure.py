@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.figure_output import write_figure
-from bench.figures.style import BLUE, ORANGE, make_panel_grid
+from bench.figures.style import BLUE, ORANGE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

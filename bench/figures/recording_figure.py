@@ -8,18 +8,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.figure_output import write_figure
 from bench.figures.signal_thinning import thin_signal
-from bench.figures.style import (
-    BLUE,
-    HELD_OUT_GREY,
-    RUN_SEPARATOR_GREY,
-    RUST,
-    make_panel_grid,
-)
+from bench.figures.style import BLUE, HELD_OUT_GREY, RUN_SEPARATOR_GREY, RUST
 from bench.logs.recording_summary import list_recorded_signals
-from sims.core.plain_values import format_unit
 from sims.core.simulator import Array, Simulator
+from sims.core.user_messages import format_unit
 from sims.recording.recording import Recording, Run
 
 if TYPE_CHECKING:

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.figures.camera_view import Projection, choose_projection, make_posed_data
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.label_text import break_name
 from bench.figures.offscreen_rendering import render_robot
-from bench.figures.style import BLUE, CAPTION_GREY, NEUTRAL_MARK, NULL_LEVEL_GREY, make_panel_grid
+from bench.figures.style import BLUE, CAPTION_GREY, NEUTRAL_MARK, NULL_LEVEL_GREY
 from sims.core.simulator import Array, InputError
 
 if TYPE_CHECKING:

@@ -7,16 +7,26 @@ value. After a few time constants nothing depends on it, and the commands up to 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sims.core.simulator import Simulator
 from sims.recording.recording import Recording, Run
 
+if TYPE_CHECKING:
+    from sims.robot.robot_model import RobotModel
+
 MAX_SETTLING_SHARE = 0.5
 """Maximum share of a run that may be left out."""
+
+SETTLING_TIME_CONSTANTS = 10.0
+"""Number of time constants after which a wrong initial activation has no effect.
+
+The remaining share exp(-10) is less than the accuracy of a simulation.
+"""
 
 
 def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
@@ -40,7 +50,7 @@ def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Rec
     # Required states are those of floating bodies; activations are the outputs of filters.
     if robot.system.required_state_units or not robot.system.activations:
         return recording, ""
-    from sims.robot.dynamics.activation_filters import activation_filters, compute_settling_time
+    from sims.robot.dynamics.activation_filters import activation_filters
 
     runs: list[Run] = []
     left_out = 0.0  # longest start of a run that is left out, s
@@ -66,3 +76,24 @@ def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Rec
         f'[runs.NAME.initial] "{filters[0].state}" = 0.0)'
     )
     return replace(recording, runs=tuple(runs)), note
+
+
+def compute_settling_time(robot: RobotModel, initial: Mapping[str, float]) -> float:
+    """Return the time in seconds after which no filter depends on its initial activation.
+
+    Filters whose initial activation is specified are ignored. The slowest of the others decides:
+    the time is `SETTLING_TIME_CONSTANTS` times its time constant, or zero without such filters.
+
+    Args:
+        robot: robot with the filters before its actuators.
+        initial: initial states of the run, by name.
+    """
+    # This import is needed for robots only.
+    from sims.robot.dynamics.activation_filters import activation_filters
+
+    unknown_filters = [
+        one_filter for one_filter in activation_filters(robot) if one_filter.state not in initial
+    ]
+    return SETTLING_TIME_CONSTANTS * max(
+        (one_filter.seconds for one_filter in unknown_filters), default=0.0
+    )

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.logs.quality.noise_estimation import SIGMA_PER_MEDIAN
+from sims.core.noise_estimation import SIGMA_PER_MEDIAN
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from bench.logs.recording_loading import load_recording
-from sims.core.plain_values import format_count
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import InputError, Simulator
+from sims.core.user_messages import format_count
 from sims.recording.recording import MAX_FOLDS, Recording, split_held_out
 
 

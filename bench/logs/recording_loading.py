@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
-
-import numpy as np
+from typing import Any
 
 from bench.core.plugin_registries import make_robot_simulator, simulators
-from sims.core.argument_checks import Expected, Name
-from sims.core.plain_values import MAX_NUMBER
+from bench.logs.quality.range_checks import check_value_sizes
 from sims.core.simulator import InputError, Simulator
 from sims.core.toml_validation import get_subtable
-from sims.recording.recording import (
-    Recording,
-    make_frame_recording,
-    read_recording,
-    read_system_name,
-    split_held_out,
-)
+from sims.recording.recording import Recording, read_recording, read_system_name, split_held_out
 from sims.recording.recording_description import (
     ModelFileReference,
     get_model_reference,
     read_model_reference,
 )
-from sims.recording.recording_frame import Frame
+from sims.recording.recording_frame import Frame, FrameDescription, make_frame_recording
 
 
 def load_recording(
@@ -117,64 +108,6 @@ def _find_system(path: str | Path, name: str) -> type[Simulator]:
         return simulators.get(name)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def check_value_sizes(recording: Recording) -> None:
-    """Reject values that are so large that sums of their squares may overflow.
-
-    Args:
-        recording: Recording to check; missing values (NaN) are ignored.
-
-    Raises:
-        InputError: A value of a channel or input exceeds `MAX_NUMBER`; the message is one line.
-    """
-    for run in recording.runs:
-        for name, values in (*run.channels.items(), *run.inputs.items()):
-            largest = float(np.nanmax(np.abs(values), initial=0.0))
-            if largest > MAX_NUMBER:
-                problem = f"expected values within ±{MAX_NUMBER:g}, found {largest:.3g}"
-                raise InputError(f"{recording.path}: run {run.name}, column {name}: {problem}")
-
-
-Units: TypeAlias = Annotated[
-    Mapping[str, str], Expected("units of columns by their names, as {'q': 'rad'}")
-]
-"""Units of a data frame's columns, by column name."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameDescription:
-    """System of a recording, and the description of a data frame, which has no `NAME.toml` file.
-
-    Attributes:
-        system: Name of the system, instead of the one that the .toml file states.
-        model: Model file of a robot, MJCF or URDF, instead of what the .toml file states.
-        units: Units of a DataFrame's columns by name (default: those in ``df.attrs["units"]``).
-        constants: Known numbers of the system in SI units, with a DataFrame.
-        description: Any further entries about a DataFrame, with the keys of ``NAME.toml``.
-    """
-
-    system: Name | None = None
-    model: str | Path | None = None
-    units: Units | None = None
-    constants: Mapping[str, float] | None = None
-    description: Mapping[str, Any] | None = None
-
-    def refuse_for_files(self, recording: object) -> None:
-        """Reject a description of a data frame if the recording is a file, which has its own.
-
-        Args:
-            recording: path of the file, for the message.
-
-        Raises:
-            InputError: units, constants or a description are given.
-        """
-        for name in ("units", "constants", "description"):
-            if getattr(self, name):
-                raise InputError(
-                    f"{name}: expected only with a DataFrame; {recording} has a description "
-                    "that states them"
-                )
 
 
 def read_frame_recording(

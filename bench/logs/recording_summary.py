@@ -10,12 +10,10 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from bench.logs.quality.noise_estimation import NoiseEstimate, count_gaps, estimate_noise
-from bench.logs.quality.range_checks import list_exceeded_ranges
-from sims.core.plain_values import align_columns, format_count, format_run_names, format_unit
+from sims.core.noise_estimation import NoiseEstimate, count_gaps, estimate_noise
 from sims.core.simulator import Channel, Simulator
+from sims.core.user_messages import align_columns, format_count, format_run_names, format_unit
 from sims.recording.recording import Recording, Run
-from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import RobotSimulator
 
 
@@ -339,40 +337,3 @@ def format_robot_summary(kind: type[Simulator]) -> Iterator[str]:
     form = robot.format.upper()
     yield f"robot {robot.path} ({form}): {words}; {integrator} at {1e3 * step:g} ms"
     yield from (f"note: {note}" for note in robot.notes)
-
-
-def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
-    """Yield warnings about a robot's signals: those missing in the log, and those beyond limits.
-
-    Other systems have none.
-
-    Args:
-        recording: Recording to check.
-        kind: Simulator class of its system.
-    """
-    if not kind.has_model:
-        return
-    robot = cast(type[RobotSimulator], kind).robot
-    yield from _list_missing_signals(recording, robot)
-    yield from list_exceeded_ranges(recording, robot)
-
-
-def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[str]:
-    """Yield a line that names the missing commands, and one for the missing joint positions.
-
-    Args:
-        recording: the recording, of which the first run counts.
-        robot: model of the robot.
-    """
-    run = recording.runs[0]
-    missing_commands = [f"u.{a.name}" for a in robot.actuators if f"u.{a.name}" not in run.inputs]
-    if missing_commands:
-        yield f"not in the log, assumed to be zero: {', '.join(missing_commands)}"
-    joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
-    missing_joints = [name for name in joints if f"q.{name}" not in run.channels]
-    if missing_joints:
-        joint_names = ", ".join(missing_joints)
-        yield (
-            "positions that are not in the log, with initial values from the model file: "
-            f"{joint_names}"
-        )

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from sims.core.root_mean_square import compute_rms
-from sims.core.simulator import Array, Simulator
+from sims.core.simulator import Array, Indices, Simulator
 from sims.recording.recording import Recording, Run
 
 MAX_UNCHANGED_RATE = 400.0
@@ -29,6 +29,12 @@ MIN_AVAILABLE_SHARE = 0.9
 """Minimum share of available samples of each channel."""
 MIN_RUN_SAMPLES = 40
 """Minimum number of samples that each run must keep."""
+
+MIN_CHANNEL_SAMPLE_SHARE = 0.5
+"""Minimum number of samples of a channel after thinning, as a share of the expected number.
+
+A channel that is sampled rarely might otherwise lose all its samples.
+"""
 
 
 def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
@@ -137,3 +143,59 @@ def _thin_run(run: Run, stride: int) -> Run:
             integrals = np.add.reduceat(run.inputs[name] * durations, kept_indices)
             inputs[name] = integrals / np.add.reduceat(durations, kept_indices)
     return replace(thinned_run, inputs=inputs)
+
+
+def take_every_nth(run: Run, factor: int) -> Run:
+    """Return the run with every n-th sample of its channels; n is `factor`.
+
+    An input becomes its mean between the kept samples, so that it has the same effect. Columns that
+    are neither channels nor inputs (`extra`) are left out.
+    """
+    kept = np.arange(0, run.times.size, factor)
+    return replace(
+        run,
+        times=run.times[kept],
+        channels={name: values[kept] for name, values in run.channels.items()},
+        inputs={
+            name: _average_input(run.times, values, kept) for name, values in run.inputs.items()
+        },
+        extra={},
+    )
+
+
+def _average_input(times: Array, values: Array, kept: Indices) -> Array:
+    """Return the mean (K,) of an input over the samples from each kept sample to the next one.
+
+    Args:
+        times: (T,) sample times in seconds.
+        values: (T,) input, held from each sample to the next one.
+        kept: (K,) indices of the kept samples.
+
+    Returns:
+        Means, weighted by duration; after the last kept sample, the mean of the rest of the run.
+    """
+    durations = np.diff(times, append=times[-1])
+    # The last sample has no duration; a tiny one avoids 0 / 0 if it is a kept sample.
+    durations[-1] = 1e-9 * max(float(times[-1] - times[0]), 1e-9)
+    # `reduceat` sums from each kept sample to the next one, exclusive.
+    weighted_sums = np.add.reduceat(values * durations, kept)
+    means: Array = weighted_sums / np.add.reduceat(durations, kept)
+    return means
+
+
+def keeps_samples(thinned_run: Run, run: Run, factor: int) -> bool:
+    """Return whether every channel keeps about its expected number of recorded samples.
+
+    A channel that is recorded at a lower rate than the others could lose nearly all its samples.
+
+    Args:
+        thinned_run: the run after subsampling.
+        run: the run before.
+        factor: every `factor`-th sample was kept.
+    """
+    for name, values in run.channels.items():
+        sample_count = int(np.isfinite(values).sum())
+        thinned_count = int(np.isfinite(thinned_run.channels[name]).sum())
+        if thinned_count < MIN_CHANNEL_SAMPLE_SHARE * sample_count / factor:
+            return False
+    return True

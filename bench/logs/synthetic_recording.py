@@ -14,24 +14,23 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 
 from bench.core.input_signals import evaluate_signal
-from bench.core.options import option
+from bench.core.option_dataclasses import option
 from bench.core.plugin_registries import make_robot_simulator, simulators
 from bench.core.random_streams import make_rng
 from bench.core.resource_estimates import check_simulation_size
 from sims import effects as library
 from sims.core.argument_checks import Expected, Name, Names, check_arguments
 from sims.core.files import check_absent
-from sims.core.plain_values import (
+from sims.core.number_limits import (
     MAX_NUMBER,
     MAX_SAMPLING_RATE_HZ,
     MIN_RUN_SECONDS,
-    append_unit,
     is_plausible_number,
-    truncate_text,
 )
 from sims.core.simulator import InputError, Scenario, Simulator
 from sims.core.system import DefaultRecording
 from sims.core.toml_validation import check_known_names
+from sims.core.user_messages import append_unit, truncate_text
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_description import ModelFileReference, get_floating_state_units
 from sims.recording.recording_writer import write_recording

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from bench.benchmark.comparison_report import format_failures
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.runner.study_base import PrintLine, Study
 from bench.benchmark.statistics.comparison_statistics import add_trust_column, build_tables
 from bench.benchmark.storage.result_folder import (
@@ -22,18 +22,26 @@ from bench.benchmark.storage.result_folder import (
     read_configuration,
 )
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
+from bench.figures.figure_layout import add_trust_note
 from bench.figures.figure_output import write_figure
-from bench.figures.style import BLUE, VERMILION, TunerStyles, add_trust_note, make_mark_style
-from bench.misspecification import misspecification_scores
-from bench.misspecification.calibration import EXTENDED, MODEL_LABELS, PLAIN
-from bench.misspecification.misspecification_scores import (
+from bench.figures.style import BLUE, VERMILION, TunerStyles, make_mark_style
+from bench.misspecification import misspecification_statistics
+from bench.misspecification.calibration_recording import EXTENDED, MODEL_LABELS, PLAIN
+from bench.misspecification.misspecification_statistics import (
     BIAS,
     PARAMETERS,
     PREDICTION,
     StudyScores,
 )
-from bench.pages.chart import Axis, Panel, ReferenceLine, Series, make_method_series
-from bench.pages.chart_figure import draw_chart, finish_chart
+from bench.pages.chart import (
+    Axis,
+    Panel,
+    ReferenceLine,
+    Series,
+    draw_chart,
+    finish_chart,
+    make_method_series,
+)
 from bench.pages.template import render_text
 from sims.core.files import write_atomically
 
@@ -221,7 +229,7 @@ def write_report(study: Study, print_line: PrintLine) -> int:
     folder, experiment = study.folder, study.configuration.experiment
     failed = _write_comparison_tables(folder, print_line)
     scores = (
-        misspecification_scores.load_scores(folder, experiment)
+        misspecification_statistics.load_scores(folder, experiment)
         if has_both_comparisons(folder)
         else None
     )
@@ -242,7 +250,7 @@ def write_joint_report(folder: Path, parts: Sequence[Path], print_line: PrintLin
     """
     complete_parts = [part for part in parts if has_both_comparisons(part)]
     outcomes = [
-        misspecification_scores.load_scores(part, read_configuration(part).experiment)
+        misspecification_statistics.load_scores(part, read_configuration(part).experiment)
         for part in complete_parts
     ]
     outcomes = [outcome for outcome in outcomes if outcome.list_targets()]
@@ -300,13 +308,16 @@ def _write_tables_and_figures(
     experiment: Experiment = outcomes[0].experiment
     frames = {
         "table": pd.concat(
-            [misspecification_scores.build_score_table(outcome) for outcome in outcomes]
+            [misspecification_statistics.build_score_table(outcome) for outcome in outcomes]
         ),
         "ranks": pd.concat(
-            [misspecification_scores.build_rank_table(outcome) for outcome in outcomes]
+            [misspecification_statistics.build_rank_table(outcome) for outcome in outcomes]
         ),
         "ranking": pd.concat(
-            [misspecification_scores.build_rank_agreement_table(outcome) for outcome in outcomes]
+            [
+                misspecification_statistics.build_rank_agreement_table(outcome)
+                for outcome in outcomes
+            ]
         ),
     }
     for name, frame in frames.items():
@@ -324,8 +335,8 @@ def _write_tables_and_figures(
     }
     if is_joint:
         # Each metric, the ranks over all systems, and the mean rank of each tuner by simulator.
-        for metric in misspecification_scores.RANKED_METRICS:
-            ranks = misspecification_scores.compute_joint_ranks(frames["ranks"], metric)
+        for metric in misspecification_statistics.RANKED_METRICS:
+            ranks = misspecification_statistics.compute_joint_ranks(frames["ranks"], metric)
             mean_ranks = pd.DataFrame({m: ranks.ranked[m].mean() for m in MODEL_LABELS})
             values["joint"].append((metric, ranks, mean_ranks))
     for line in render_text(_TEMPLATE, **values, PARAMETERS=PARAMETERS, models=MODEL_LABELS):

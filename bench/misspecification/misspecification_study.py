@@ -23,7 +23,7 @@ from bench.benchmark.storage.run_status import (
 )
 from bench.benchmark.storage.secret_salt import read_salt
 from bench.core.plugin_registries import simulators
-from bench.misspecification.calibration import (
+from bench.misspecification.calibration_recording import (
     EXTENDED,
     MODEL_LABELS,
     PLAIN,
@@ -32,7 +32,7 @@ from bench.misspecification.calibration import (
 from sims.extended_simulator import list_effect_coefficients, open_extended
 
 if TYPE_CHECKING:
-    from bench.benchmark.problem.experiment import Experiment
+    from bench.benchmark.problem.experiment_config import Experiment
     from bench.benchmark.runner.experiment_runner import ProgressFactory
     from bench.benchmark.runner.study_base import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool

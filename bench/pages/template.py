@@ -6,11 +6,9 @@ they are cleaned and escaped, and only `markupsafe.Markup` is written as it is.
 
 from __future__ import annotations
 
-import shlex
 import sys
 import textwrap
 from base64 import b64encode
-from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
 from math import isfinite
@@ -19,22 +17,25 @@ from typing import TYPE_CHECKING, Any
 
 import jinja2
 from jinja2.bccache import Bucket, FileSystemBytecodeCache
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from bench.pages.text_format import (
+    align_cells,
     append_unit,
+    format_document,
+    format_frame,
     format_number,
     format_p_value,
     format_percent,
     format_significant,
     format_unit,
     joined,
+    quote_words,
     sanitise,
 )
-from sims.core.plain_values import align_columns, format_count
+from sims.core.user_messages import format_count
 
 if TYPE_CHECKING:
-    import pandas as pd
     from jinja2 import Environment, Template
 
 
@@ -42,10 +43,6 @@ TEMPLATES = Path(__file__).parent / "templates"
 """Folder of the templates that all pages share."""
 MAX_TEXT_LENGTH = 2000
 """Maximum number of characters of a text, unless its template asks for fewer."""
-MAX_DOCUMENT_LENGTH = 6000
-"""Maximum number of characters of a text of several lines, unless its template asks for more."""
-CELL_SEPARATOR = "¦"
-"""Separator of the cells in a line of a table that a text template aligns."""
 
 
 def load_template(path: Path) -> Template:
@@ -141,51 +138,6 @@ def _clean(value: object) -> object:
         return value
     # A non-breaking space keeps a number and its percent sign on one line.
     return sanitise(value, MAX_TEXT_LENGTH).replace(" %", "\u00a0%")
-
-
-def align_cells(text: str, left_columns: int) -> str:
-    """Align the cells of a table for a terminal.
-
-    Args:
-        text: Lines whose cells are separated by `CELL_SEPARATOR`.
-        left_columns: Number of columns, from the first one, that are left-justified.
-    """
-    rows = [line.split(CELL_SEPARATOR) for line in text.strip("\n").split("\n")]
-    return "\n".join(align_columns(rows, left_columns)) + "\n"
-
-
-def format_frame(frame: pd.DataFrame, spec: str) -> str:
-    """Format a table of numbers for a terminal, without names of its axes.
-
-    Args:
-        frame: Table with the names of its rows as index.
-        spec: Format of its numbers, such as ``.2g``.
-    """
-    unnamed: pd.DataFrame = frame.rename_axis(index=None, columns=None)
-    text: str = unnamed.to_string(float_format=lambda value: f"{value:{spec}}")
-    return text
-
-
-def quote_words(words: Iterable[object]) -> Markup:
-    """Format a command with its words quoted for a shell, as HTML.
-
-    Line breaks and escape sequences in a path must not reach a terminal unchanged.
-    """
-    return escape(shlex.join(sanitise(word, 500) for word in words))
-
-
-def format_document(text: str, max_length: int = MAX_DOCUMENT_LENGTH) -> Markup:
-    """Format a text of several lines with its indentation, as HTML.
-
-    Args:
-        text: Text.
-        max_length: Maximum number of characters.
-    """
-    shown = text if len(text) <= max_length else f"{text[:max_length]} …"
-    lines = shown.strip("\n").replace("\t", "    ").split("\n")
-    # `sanitise` removes leading spaces, so they are added again.
-    indented = (" " * (len(line) - len(line.lstrip())) + sanitise(line, 1000) for line in lines)
-    return escape("\n".join(indented))
 
 
 class CompiledTemplates(FileSystemBytecodeCache):

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
+import shlex
 from collections.abc import Iterable, Sequence
 from math import floor, isfinite, log10
+from typing import TYPE_CHECKING
 
-from sims.core import plain_values
-from sims.core.plain_values import SUPERSCRIPT_DIGITS
+from markupsafe import Markup, escape
+
+from sims.core import user_messages
+from sims.core.user_messages import SUPERSCRIPT_DIGITS, align_columns
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _MIN_EXPONENT = -300
 """Smallest exponent of ten of which the power is computed directly."""
@@ -23,6 +30,12 @@ This is the rule of the Particle Data Group.
 """
 _MIN_WRITTEN_P_VALUE = 1e-12
 """Smallest p-value that is written as a number."""
+
+MAX_DOCUMENT_LENGTH = 6000
+"""Maximum number of characters of a text of several lines, unless its template asks for more."""
+
+CELL_SEPARATOR = "¦"
+"""Separator of the cells in a line of a table that a text template aligns."""
 
 
 def sanitise(text: object, max_length: int = 400) -> str:
@@ -124,12 +137,12 @@ def format_estimate(value: float, low: float | None, high: float | None) -> str:
 
 def format_unit(unit: str) -> str:
     """Format a unit from a file, such as ``kg·m²``; empty for a pure number."""
-    return plain_values.format_unit(sanitise(unit, 60))
+    return user_messages.format_unit(sanitise(unit, 60))
 
 
 def append_unit(text: str, unit: str) -> str:
     """Append a unit from a file to a number; a pure number has none."""
-    return plain_values.append_unit(text, sanitise(unit, 60))
+    return user_messages.append_unit(text, sanitise(unit, 60))
 
 
 def format_percent(share: float | None) -> str:
@@ -191,3 +204,48 @@ def format_csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def _escape_formula(cell: object) -> object:
     return f"'{cell}" if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@")) else cell
+
+
+def align_cells(text: str, left_columns: int) -> str:
+    """Align the cells of a table for a terminal.
+
+    Args:
+        text: Lines whose cells are separated by `CELL_SEPARATOR`.
+        left_columns: Number of columns, from the first one, that are left-justified.
+    """
+    rows = [line.split(CELL_SEPARATOR) for line in text.strip("\n").split("\n")]
+    return "\n".join(align_columns(rows, left_columns)) + "\n"
+
+
+def format_frame(frame: pd.DataFrame, spec: str) -> str:
+    """Format a table of numbers for a terminal, without names of its axes.
+
+    Args:
+        frame: Table with the names of its rows as index.
+        spec: Format of its numbers, such as ``.2g``.
+    """
+    unnamed: pd.DataFrame = frame.rename_axis(index=None, columns=None)
+    text: str = unnamed.to_string(float_format=lambda value: f"{value:{spec}}")
+    return text
+
+
+def quote_words(words: Iterable[object]) -> Markup:
+    """Format a command with its words quoted for a shell, as HTML.
+
+    Line breaks and escape sequences in a path must not reach a terminal unchanged.
+    """
+    return escape(shlex.join(sanitise(word, 500) for word in words))
+
+
+def format_document(text: str, max_length: int = MAX_DOCUMENT_LENGTH) -> Markup:
+    """Format a text of several lines with its indentation, as HTML.
+
+    Args:
+        text: Text.
+        max_length: Maximum number of characters.
+    """
+    shown = text if len(text) <= max_length else f"{text[:max_length]} …"
+    lines = shown.strip("\n").replace("\t", "    ").split("\n")
+    # `sanitise` removes leading spaces, so they are added again.
+    indented = (" " * (len(line) - len(line.lstrip())) + sanitise(line, 1000) for line in lines)
+    return escape("\n".join(indented))

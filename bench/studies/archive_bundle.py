@@ -11,7 +11,6 @@ paper. `simgap verify` checks whether an archive made elsewhere is consistent.
 from __future__ import annotations
 
 import json
-import shlex
 import shutil
 import stat
 import zipfile
@@ -26,30 +25,28 @@ from typing import Any, NamedTuple
 from bench import __version__
 from bench.benchmark.storage.provenance import (
     compute_sha256,
-    format_explain_command,
+    format_repeated_explain_command,
     read_environment,
 )
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_configuration
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
-from bench.misspecification.calibration import MODEL_LABELS
+from bench.diagnosis.verdict import VERDICT_FILE
+from bench.misspecification.calibration_recording import MODEL_LABELS
 from bench.schemas import find_violations
-from bench.studies.comparison_verification import (
+from bench.studies.result_verification import (
+    RECORDINGS_FOLDER,
+    ExplanationVerification,
+    PrintLine,
     VerificationFailure,
     VerificationResult,
     print_failures,
     verify_comparison,
-)
-from bench.studies.explanation_verification import (
-    EXTENDED_MODEL_FILE,
-    RECORDINGS_FOLDER,
-    VERDICT_FILE,
-    ExplanationVerification,
-    PrintLine,
     verify_extended_model,
 )
-from bench.studies.study import list_study_folders
+from bench.studies.study_kinds import list_study_folders
 from sims.core.files import atomic_replacement
 from sims.core.simulator import InputError
+from sims.extended_simulator import EXTENDED_MODEL_FILE
 
 MANIFEST_FILE = "manifest.json"
 MAX_UNPACKED_BYTES = 8 << 30
@@ -366,7 +363,7 @@ def write_bundle(
         command = _format_compare_command(folder, name)
     else:
         files |= _list_recording_files(recordings)
-        command = _format_explain_command(folder)
+        command = format_repeated_explain_command(folder)
     metadata = {
         "format": _FORMAT_VERSION,
         "kind": kind,
@@ -491,26 +488,6 @@ def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
             if path.is_file():
                 files[f"{RECORDINGS_FOLDER}/{path.name}"] = path
     return files
-
-
-def _format_explain_command(folder: Path) -> str:
-    """Build the command that reproduces an explanation, as far as its folder states it.
-
-    Args:
-        folder: Folder of an explanation, with the record of its settings and recordings.
-
-    Returns:
-        Command line for a shell.
-    """
-    environment = read_environment(folder)
-    # The descriptions of recordings (.toml) are listed too, but are not arguments of the command.
-    tables = [
-        recording["file"]
-        for recording in environment.get("recordings", [])
-        if not recording["file"].endswith(".toml")
-    ]
-    words = format_explain_command(tables or ["RECORDING.csv"], environment.get("settings", {}))
-    return shlex.join(words)
 
 
 class Verification(NamedTuple):

@@ -15,13 +15,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.comparison_charts import make_simulations_axis
-from bench.benchmark.comparison_figures import draw_critical_difference_figure
-from bench.benchmark.comparison_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, add_trust_column
-from bench.benchmark.statistics.error_curves import RunCurves
+from bench.benchmark.comparison_charts import PANEL_TITLES, make_simulations_axis
+from bench.benchmark.comparison_report import REPORT_FILE
+from bench.benchmark.statistics.comparison_statistics import (
+    REQUIRED_RUN_COLUMNS,
+    ComparisonStatistics,
+    add_trust_column,
+)
 from bench.benchmark.statistics.expected_running_time import (
-    compute_solved_fraction,
+    compute_runtime_shares,
 )
 from bench.benchmark.statistics.paired_tests import compare_all_pairs
 from bench.benchmark.statistics.tuner_ranking import (
@@ -31,20 +33,16 @@ from bench.benchmark.statistics.tuner_ranking import (
     compute_problem_ranks,
 )
 from bench.benchmark.storage.result_folder import read_comparison
+from bench.figures.figure_layout import add_trust_note, make_panel_grid
 from bench.figures.figure_output import FigureFiles, render_all_formats, write_figures
-from bench.figures.style import (
-    PANEL_TITLES,
-    MarkStyle,
-    add_trust_note,
-    get_mark_style,
-)
-from bench.pages.chart import Axis, Panel, make_method_series
-from bench.pages.chart_figure import draw_chart, finish_chart
+from bench.figures.style import NEUTRAL_MARK, MarkStyle, get_colour, get_mark_style
+from bench.pages.chart import Axis, Panel, draw_chart, finish_chart, make_method_series
 from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
 from sims.core.simulator import Array, InputError
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 
@@ -270,35 +268,9 @@ class ComparisonCollection:
         distributions = [
             problem
             for part in self.parts
-            for problem in _compute_runtime_shares(part.curves, part.runtime_thresholds)
+            for problem in compute_runtime_shares(part.curves, part.runtime_thresholds)
         ]
         return {t: np.mean([problem[t] for problem in distributions], axis=0) for t in self.tuners}
-
-
-def _compute_runtime_shares(curves: RunCurves, thresholds: Array) -> list[dict[str, Array]]:
-    """Compute the share of thresholds that each tuner has reached after 0..100 % of the budget.
-
-    Problems have different budgets, so shares of it make them comparable.
-
-    Args:
-        curves: errors of all runs of one comparison.
-        thresholds: thresholds of the runtime distribution.
-
-    Returns:
-        For each range: the shares (101,) by tuner.
-    """
-    budget = curves.values.shape[1] - 1
-    points = np.floor(np.linspace(0, budget, 101)).astype(np.int64)
-    shares = []
-    for kind in dict.fromkeys(curves.keys["range"]):
-        range_curves = curves.select(range=str(kind))
-        shares.append(
-            {
-                t: compute_solved_fraction(range_curves.select(tuner=t), thresholds, points)
-                for t in range_curves.list_tuners()
-            }
-        )
-    return shares
 
 
 def _make_runtime_panel(
@@ -406,3 +378,33 @@ def render_multi_problem_page(
         error_panels=error_panels,
         rank_columns=[[name, "", 3] for name in collection.styles],
     )
+
+
+def draw_critical_difference_figure(
+    ranked: pd.DataFrame, p_values: pd.DataFrame, friedman: float
+) -> Figure:
+    """Draw the critical-difference diagram: mean ranks over problems.
+
+    Bars join tuners that do not differ significantly at 5 %.
+
+    Args:
+        ranked: Ranks, one row per problem, one column per tuner.
+        p_values: P-values of Nemenyi's test of each pair of tuners.
+        friedman: P-value of Friedman's test.
+    """
+    from scikit_posthocs import critical_difference_diagram
+
+    # Width and height in inches, with the space for each tuner.
+    figure, axes = make_panel_grid(1, 1, (8.5, 1.6 + 0.28 * ranked.shape[1]))
+    axis = axes[0, 0]
+    # Each tuner has its colour of every other figure; text stays dark, since light colours are hard
+    # to read.
+    colours = {str(name): get_colour(index) for index, name in enumerate(ranked.columns)}
+    artists = critical_difference_diagram(
+        ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9}, color_palette=colours
+    )
+    for label in artists["labels"]:
+        label.set_color(NEUTRAL_MARK)
+    tests = f"Friedman p = {friedman:.2g}; bars: Nemenyi p > 0.05"
+    axis.set_title(f"Mean rank over {len(ranked)} problems, 1 is best ({tests})", fontsize=10)
+    return figure

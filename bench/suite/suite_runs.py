@@ -16,14 +16,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
-from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.problem.experiment_config import Experiment
+from bench.benchmark.statistics.comparison_statistics import (
+    REQUIRED_RUN_COLUMNS,
+    ComparisonStatistics,
+)
 from bench.benchmark.statistics.error_curves import RunCurves
 from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
-from bench.misspecification.calibration import MODEL_LABELS, PLAIN
+from bench.misspecification.calibration_recording import MODEL_LABELS, PLAIN
 from sims.core.files import atomic_replacement, write_atomically
 from sims.core.simulator import Array, InputError
 

@@ -16,13 +16,9 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.statistics.bootstrap import compute_percentile_interval, draw_target_resamples
-from bench.benchmark.statistics.error_curves import RunCurves
+from bench.benchmark.statistics.error_curves import RunCurves, compute_log_errors
 from bench.benchmark.statistics.expected_running_time import compute_effort
-from bench.benchmark.statistics.paired_tests import (
-    compare_pair,
-    compute_log_errors,
-    correct_holm,
-)
+from bench.benchmark.statistics.paired_tests import compare_pair, correct_holm
 from bench.core.random_streams import make_rng
 from bench.suite.suite_runs import SuiteRuns
 from sims.core.simulator import Array

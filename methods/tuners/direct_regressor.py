@@ -8,8 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from methods.learning.input_features import FeatureConfig
-from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign
-from methods.learning.pair_tuner import PairTuner
+from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign, PairTuner
 from methods.tuner import Proposal, Task, TunerGenerator
 
 
@@ -29,13 +28,13 @@ class DirectRegressor(PairTuner):
         each: simulations in each scenario, at least 2 (dim + 1).
         points: points to which each run is resampled.
         inputs: inputs kept of those an observation offers.
-        strictness: see `methods.learning.observation_features.make_weighted_features`.
+        strictness: see `methods.learning.input_features.make_weighted_features`.
         noise: as in `methods.tuners.tunenet.TuneNet`.
         epochs: passes over the training data.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
         told: read what is known of the scenario too, where scenarios differ in it
-            (`methods.learning.scenario_features`).
+            (`methods.learning.input_features`).
         channels: first and last channel that is read, by number, where targets do not show the
             others; None for all.
         clean: as in `methods.tuners.tunenet.TuneNet`.

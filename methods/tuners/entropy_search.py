@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from methods.learning.gaussian_process import GaussianProcess, KernelSettings
-from methods.learning.training_data import generate_quasi_random_points
+from methods.learning.quasi_random_points import generate_quasi_random_points
 from methods.tuner import Array, Proposal, Task, Tuner, TunerGenerator
 
 _PUBLISHED_DRAWS = 200

@@ -136,7 +136,7 @@ class InContextTransformer(NoiseMatchedTuner[TrainedHistoryNetwork]):
         each: simulations in each scenario, at least 2 (dim + 1): a target and a search for it.
         points: points to which each run is resampled.
         inputs: inputs kept of those an observation offers.
-        strictness: see `methods.learning.observation_features.make_weighted_features`.
+        strictness: see `methods.learning.input_features.make_weighted_features`.
         noise: as in `methods.tuners.tunenet.TuneNet`.
         epochs: passes over the training scenarios.
         rate: learning rate at the beginning.

@@ -35,7 +35,7 @@ class NeuralPosteriorEstimation(Tuner):
 
     It simulates the mean of the learned posterior, then samples of it, and keeps the lowest loss.
 
-    It reads the same numbers of an observation as TuneNet does (`learning.observation_features`),
+    It reads the same numbers of an observation as TuneNet does (`learning.input_features`),
     of the target alone.
 
     Attributes:
@@ -43,7 +43,7 @@ class NeuralPosteriorEstimation(Tuner):
         each: simulations in each scenario, at least 2 (dim + 1).
         points: points to which each run is resampled.
         inputs: inputs kept of those an observation offers.
-        strictness: see `methods.learning.observation_features.make_weighted_features`.
+        strictness: see `methods.learning.input_features.make_weighted_features`.
         noise: sensor noise that every second training observation gets, 1 sigma, in units of each
             channel's standard deviation in training.
         hidden: units of each layer of the flow.

@@ -19,8 +19,7 @@ import numpy as np
 
 from methods.learning.broyden_search import MIN_STEP, BroydenSearch
 from methods.learning.input_features import FeatureConfig
-from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign
-from methods.learning.pair_tuner import PairTuner
+from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign, PairTuner
 from methods.tuner import Proposal, Task, TunerGenerator
 
 
@@ -34,7 +33,7 @@ class TuneNet(PairTuner):
     its newest guess.
 
     The default differs from the published method in what the network sees
-    (`learning.observation_features`), in its training (`pair_network.PairNetworkDesign`), in
+    (`learning.input_features`), in its training (`pair_network.PairNetworkDesign`), in
     h(o, o) = 0 by construction, and in the step: the estimates are read as the residuals of an
     equation h = 0, solved by Broyden's method (Math. Comp. 19, 1965; in one dimension the secant),
     which starts as Algorithm 1 does and converges where the network's scale is wrong, as outside
@@ -46,7 +45,7 @@ class TuneNet(PairTuner):
             pair.
         points: points to which each run is resampled; L in Algorithm 1.
         inputs: inputs kept of those an observation offers.
-        strictness: see `methods.learning.observation_features.make_weighted_features`.
+        strictness: see `methods.learning.input_features.make_weighted_features`.
         noise: sensor noise that a second network prepares for, 1 sigma, in units of each channel's
             standard deviation in training; used where the target is rougher than the simulations. 0
             for no second network.
@@ -54,7 +53,7 @@ class TuneNet(PairTuner):
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
         told: read what is known of the scenario too, where scenarios differ in it
-            (`methods.learning.scenario_features`).
+            (`methods.learning.input_features`).
         channels: first and last channel that is read, by number, where targets do not show the
             others; None for all.
         clean: whether targets may be as clean as simulations. False for a sensor whose errors last

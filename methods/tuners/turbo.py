@@ -15,7 +15,6 @@ with the process's length scales l_i, so that its volume is length^d whatever th
 
 from __future__ import annotations
 
-import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -23,6 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from methods.learning.library_isolation import isolated_library_call
+from methods.learning.quasi_random_points import draw_sobol_points
 from methods.tuner import Array, Task, Tuner, TunerGenerator
 
 _MIN_RELATIVE_IMPROVEMENT = 0.999
@@ -87,7 +87,7 @@ class TuRBO(Tuner):
         first: Array | None = task.start
         while True:
             count = max(2, self.initial * task.dim)
-            points = list(_draw_sobol_points(rng, count, task.dim))
+            points = list(draw_sobol_points(rng, count, task.dim))
             if first is not None:  # the start is used in the first region only
                 points[0] = first
                 first = None
@@ -190,21 +190,11 @@ class TuRBO(Tuner):
         dim = len(centre)
         low = np.clip(centre - side_lengths / 2.0, 0.0, 1.0)
         high = np.clip(centre + side_lengths / 2.0, 0.0, 1.0)
-        spread = low + (high - low) * _draw_sobol_points(rng, self.candidates, dim)
+        spread = low + (high - low) * draw_sobol_points(rng, self.candidates, dim)
         is_perturbed = rng.uniform(size=spread.shape) <= min(_MAX_PERTURBED_COORDINATES / dim, 1.0)
         # At least one coordinate is changed, because the centre has already been simulated.
         is_perturbed[~is_perturbed.any(axis=1), rng.integers(dim)] = True
         return np.where(is_perturbed, spread, centre)
-
-
-def _draw_sobol_points(rng: np.random.Generator, n: int, dim: int) -> Array:
-    """Return scrambled Sobol points (n, dim): quasi-random, evenly spread in the unit cube."""
-    from scipy.stats import qmc
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # n need not be a power of two
-        points: Array = qmc.Sobol(dim, seed=rng).random(n)
-    return points
 
 
 def _fit_gaussian_process(points: Array, values: Array) -> Any:

@@ -19,8 +19,9 @@ from typing import Annotated, Any, ParamSpec, TypeVar, Union, get_args, get_orig
 
 import numpy as np
 
-from sims.core.plain_values import is_plausible_number, truncate_text
+from sims.core.number_limits import is_plausible_number
 from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.user_messages import truncate_text
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -17,8 +17,8 @@ from itertools import islice
 from pathlib import Path
 from typing import IO, Any
 
-from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
+from sims.core.user_messages import truncate_text
 
 _MAX_SEARCHED_ENTRIES = 10_000
 """Maximum number of a folder's entries among which similar names are searched."""

@@ -9,18 +9,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sims.core.plain_values import (
-    MAX_MESSAGE_LENGTH,
-    MAX_NUMBER,
-    MAX_QUOTED_NAME_LENGTH,
-    truncate_text,
-)
+from sims.core.number_limits import MAX_NUMBER
+from sims.core.user_messages import MAX_MESSAGE_LENGTH, MAX_QUOTED_NAME_LENGTH, truncate_text
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -417,45 +413,3 @@ class Simulator(ABC):
                 subject = f"{kind} '{name}' of simulator {self.name}"
                 raise InputError(f"{subject} must be finite, found {truncate_text(str(value))}")
         return {**defaults, **given_values}
-
-
-def apply_parameter_changes(
-    parameters: Sequence[Parameter], changes: Mapping[str, Mapping[str, Any]]
-) -> tuple[Parameter, ...]:
-    """Replace attributes of parameters as an experiment states.
-
-    Args:
-        parameters: Parameters of a simulator.
-        changes: New attributes by parameter, such as ``{"restitution": {"training": (0.3, 0.7)}}``.
-
-    Returns:
-        The changed parameters.
-
-    Raises:
-        InputError: A parameter or attribute is unknown, or a value is not possible.
-    """
-    names = [p.name for p in parameters]
-    allowed_attributes = ("nominal", "bounds", "training", "log")
-    for name, change in changes.items():
-        if name not in names:
-            raise make_unknown_name_error("parameter", name, names)
-        for attribute in change:
-            if attribute not in allowed_attributes:
-                raise make_unknown_name_error(
-                    f"attribute of parameter {name}", attribute, allowed_attributes
-                )
-    pairs = ("bounds", "training")  # given as lists in an experiment's file
-    changed_parameters = []
-    for p in parameters:
-        change = changes.get(p.name, {})
-        new_values: dict[str, Any] = {k: tuple(v) if k in pairs else v for k, v in change.items()}
-        changed = replace(p, **new_values)  # this also checks the new parameter
-        # Parameters that are positive by nature, such as masses, must stay positive.
-        (old_low, _), (new_low, _) = p.bounds, changed.bounds
-        if old_low >= 0 and (new_low < 0 or (old_low > 0 and new_low == 0)):
-            condition = "more than 0" if old_low > 0 else "at least 0"
-            raise InputError(
-                f"parameter {p.name}: bounds must be {condition}, found {changed.bounds}"
-            )
-        changed_parameters.append(changed)
-    return tuple(changed_parameters)

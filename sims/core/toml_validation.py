@@ -18,8 +18,9 @@ from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from sims.core.files import require_file
-from sims.core.plain_values import MAX_INTEGER, MAX_NUMBER, MAX_TITLE_LENGTH, truncate_text
+from sims.core.number_limits import MAX_INTEGER, MAX_NUMBER
 from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.user_messages import MAX_TITLE_LENGTH, truncate_text
 
 if sys.version_info >= (3, 11):
     import tomllib as tomllib  # re-exported for other modules
@@ -440,3 +441,18 @@ def list_nested_names(tables: Mapping[str, Any]) -> list[str]:
         )
         names += [f"{name}.{inner}" for inner in list_nested_names(entry)] if nested else [name]
     return names
+
+
+def to_toml_value(value: Any) -> Any:
+    """Copy a value as plain dicts, lists and numbers, as TOML gives them.
+
+    NumPy numbers become Python numbers, tuples become lists, and keys become text.
+    """
+    # The command line imports this module, and starts faster without NumPy.
+    import numpy as np
+
+    if isinstance(value, Mapping):
+        return {str(key): to_toml_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_toml_value(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sims.core.effect import Effect
-from sims.core.plain_values import is_plausible_number
+from sims.core.number_limits import is_plausible_number
 from sims.core.simulator import InputError
 from sims.core.system import System
 from sims.core.toml_validation import format_value

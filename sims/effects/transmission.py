@@ -28,6 +28,7 @@ is an additional number, as a share of the joint's.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -35,6 +36,7 @@ import numpy as np
 
 from sims.core.effect import (
     Coefficient,
+    Effect,
     HiddenState,
     HiddenStateEffect,
     ModelValueEffect,
@@ -280,3 +282,23 @@ def _compute_gravity_acceleration(moment: StateSnapshot, y: Array) -> Array:
     weight = moment.system.weight(moment_at_y)[:, moment.system.primary, None]
     fall: Array = weight / moment.inertia
     return fall
+
+
+def make_series_element(kind: type[Effect], numbers: Mapping[str, Array]) -> SeriesElement:
+    """Make the element in series with a joint, a spring or a gap, from an effect's coefficients.
+
+    Args:
+        kind: class of the effect, for which `is_series_effect` is true.
+        numbers: coefficients (L,) of L batch elements by name; missing ones are zero.
+    """
+    assert issubclass(kind, HiddenStateEffect)
+    zeros = np.zeros_like(next(iter(numbers.values())))
+    # `between` are the coefficients of an element whose both sides are known, as in a robot.
+    values = [numbers.get(coefficient.name, zeros) for coefficient in kind.between]
+    return kind().element(np.stack(values))
+
+
+def combine_elements(elements: Sequence[SeriesElement]) -> SeriesElement:
+    """Combine several elements in series with one joint by adding their numbers."""
+    names = ("stiffness", "damping", "gap", "drive")
+    return SeriesElement(*(np.sum([getattr(e, name) for e in elements], axis=0) for name in names))

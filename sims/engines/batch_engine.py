@@ -11,9 +11,9 @@ import numpy as np
 
 from sims.core.argument_checks import check_positive
 from sims.core.engine import IntegrationBatch, Trajectories, make_unsupported_error
-from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
 from sims.core.system import System
+from sims.core.user_messages import truncate_text
 from sims.engines.compiled.batch_runner import integrate_batch
 from sims.engines.compiled.data_layout import MAX_COORDINATES
 from sims.engines.compiled.step_size import MAX_PHASE_PER_STEP

@@ -35,9 +35,9 @@ def describe_stepping() -> str:
     # Systems are declared by importing this module.
     if "sims.system_simulator" not in sys.modules:
         return "none"
-    from sims.engines.compiled import kernel
+    from sims.engines.compiled import element_stepping
 
-    kernel.COMPILED.load()
+    element_stepping.COMPILED.load()
     return "machine code"
 
 

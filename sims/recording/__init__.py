@@ -6,7 +6,7 @@ The main modules, in the order in which to read them:
 * `recording_description`: the TOML file, which states what the columns are
 * `csv_table`: the CSV file, read cell by cell or, if it is large and faultless, by PyArrow
 * `recording_frame`: columns of a pandas DataFrame, checked as those of a CSV file
-* `log_formats`: logs in other formats; `log_joining` joins several by time
+* `log_formats`: logs in other formats; `log_time_alignment` joins several by time
 * `unit_conversion`: conversion of the file's units to SI units
 * `recording_writer`: write a recording such that reading gives it back unchanged
 """

@@ -19,9 +19,10 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from sims.core.files import require_file
-from sims.core.plain_values import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
+from sims.core.number_limits import MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
 from sims.core.simulator import Array, InputError, make_read_only, similar
 from sims.core.toml_validation import format_value
+from sims.core.user_messages import MAX_NAME_LENGTH
 
 MIN_FAST_PARSE_BYTES = 1 << 20
 """Minimum size in bytes of a table for which importing the fast parser is worthwhile."""

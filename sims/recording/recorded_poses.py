@@ -18,9 +18,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from sims.core.rotations import compute_yaw_pitch_roll
+from sims.core.angles_and_quaternions import compute_yaw_pitch_roll, unwrapped
 from sims.core.simulator import Array, InputError
-from sims.recording.unit_conversion import unwrapped
 
 POSITION_AXES = ("x", "y", "z")
 """Axes of translation, those of the world; the channel of the first is ``q.BASE.x``."""

@@ -4,6 +4,8 @@ The table has the columns `run`, `t` (seconds, increasing within a run) and one 
 input, in the units that the description states; an empty cell is a missing sample. Values are
 converted to SI units. Nothing is guessed, and the files are not changed. Every error is one line:
 file, row, column, what was expected, what was found.
+
+Division of a recording into runs for fitting and held-out runs or folds.
 """
 
 from __future__ import annotations
@@ -11,17 +13,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.angles_and_quaternions import unwrapped
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.core.toml_validation import check_known_names
 from sims.recording.column_mapping import RecordingSources
 from sims.recording.csv_table import CsvRun, has_run_column, read_table
 from sims.recording.drive_switches import apply_drive_switches
-from sims.recording.log_joining import read_logs
+from sims.recording.log_time_alignment import read_logs
 from sims.recording.recorded_poses import convert_quaternions
 from sims.recording.recording_description import (
     DeclaredSignals,
@@ -33,13 +36,7 @@ from sims.recording.recording_description import (
     read_meta,
     read_system_name,
 )
-from sims.recording.recording_frame import (
-    Frame,
-    build_frame_description,
-    move_index_to_columns,
-    read_frame,
-)
-from sims.recording.unit_conversion import IDENTITY_SCALE, UnitScale, unwrapped
+from sims.recording.unit_conversion import IDENTITY_SCALE, UnitScale
 
 __all__ = ["DeclaredSignals", "Recording", "Run", "read_recording", "read_system_name"]
 
@@ -233,13 +230,13 @@ def read_recording(path: str | Path, declared: DeclaredSignals, whole: bool = Fa
     else:
         parts = read_logs(table.with_suffix(".csv"), sources, channels, inputs, description.linear)
     model = get_model_reference(description_path, meta)
-    recording = _assemble_recording(table, parts, description, description_path, model)
+    recording = assemble_recording(table, parts, description, description_path, model)
     if whole:
         return recording
-    return replace(recording, runs=_split_runs(description_path, recording.runs, folds=False))
+    return replace(recording, runs=split_runs(description_path, recording.runs, folds=False))
 
 
-def _assemble_recording(
+def assemble_recording(
     table: Path,
     parts: Sequence[CsvRun],
     description: RecordingDescription,
@@ -314,61 +311,8 @@ def _read_own_table(
     return renamed_runs
 
 
-def make_frame_recording(
-    frame: Frame,
-    declared: DeclaredSignals,
-    meta: Mapping[str, Any],
-    units: Mapping[str, str],
-    name: str = "DataFrame",
-) -> Recording:
-    """Make a recording from a data frame, checked as `read_recording` checks files.
-
-    Only the marked runs are held out.
-
-    Args:
-        frame: Data frame with columns ``run`` (for several runs), ``t`` and one for each channel
-            and input.
-        declared: System, or simulator of it.
-        meta: Description of the frame, with the keys of `NAME.toml`.
-        units: Units of columns by name; missing ones are taken from `meta` and
-            ``frame.attrs["units"]``.
-        name: Name of the frame in messages.
-
-    Raises:
-        InputError: The frame is malformed; the message is one line.
-    """
-    path = Path(name)
-    indexed_frame = move_index_to_columns(path, frame)
-    document = build_frame_description(path, indexed_frame, declared, meta, units)
-    description = check_description(path, document, declared)
-    parts = read_frame(path, indexed_frame, description)
-    return _assemble_recording(path, parts, description, path, get_model_reference(path, document))
-
-
-def split_held_out(recording: Recording, folds: bool = False) -> Recording:
-    """Divide the runs of a recording into runs for fitting and held-out runs.
-
-    Marked runs are held out; without marks every third run, or the last third of a single run.
-
-    Args:
-        recording: Recording with its marks.
-        folds: Whether to number two or three unmarked runs as cross-validation folds instead of
-            holding one of them out.
-
-    Raises:
-        InputError: All runs are held out, or a single run is too short to be divided.
-    """
-    path = recording.path
-    description = path.with_suffix(".toml") if path.suffix == ".csv" else path
-    return replace(recording, runs=_split_runs(description, recording.runs, folds))
-
-
-MAX_FOLDS = 3
-"""Maximum number of unmarked runs for cross-validation; of more, every third is held out."""
 _UNMARKED = RunMetadata({}, {}, None)
 """Metadata of a run that the description does not mention."""
-_HELD_OUT_STRIDE = 3
-"""Every third run, or the last third of the samples of a single run, is held out."""
 
 
 def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> Run:
@@ -447,7 +391,32 @@ def _convert_column(table: Path, part: CsvRun, name: str, scale: UnitScale) -> A
     return make_read_only(result)
 
 
-def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
+MAX_FOLDS = 3
+"""Maximum number of unmarked runs for cross-validation; of more, every third is held out."""
+
+_HELD_OUT_STRIDE = 3
+"""Every third run, or the last third of the samples of a single run, is held out."""
+
+
+def split_held_out(recording: Recording, folds: bool = False) -> Recording:
+    """Divide the runs of a recording into runs for fitting and held-out runs.
+
+    Marked runs are held out; without marks every third run, or the last third of a single run.
+
+    Args:
+        recording: Recording with its marks.
+        folds: Whether to number two or three unmarked runs as cross-validation folds instead of
+            holding one of them out.
+
+    Raises:
+        InputError: All runs are held out, or a single run is too short to be divided.
+    """
+    path = recording.path
+    description = path.with_suffix(".toml") if path.suffix == ".csv" else path
+    return replace(recording, runs=split_runs(description, recording.runs, folds))
+
+
+def split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
     """Divide the runs into runs for fitting and held-out runs, on which predictions are tested.
 
     There are four cases:

@@ -6,23 +6,33 @@ Columns of a ``DataFrame`` are checked by the same rules as those of `NAME.csv`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
-from sims.core.plain_values import is_plausible_number, to_toml_value
+from sims.core.argument_checks import Expected, Name
+from sims.core.number_limits import is_plausible_number
 from sims.core.simulator import Array, InputError, make_unknown_name_error, similar
-from sims.core.toml_validation import format_value, get_subtable, join_nested_names
+from sims.core.toml_validation import format_value, get_subtable, join_nested_names, to_toml_value
 from sims.recording.column_mapping import SignalSource
 from sims.recording.csv_table import CsvRun, RecordingTable
 from sims.recording.drive_switches import read_switches
+from sims.recording.recording import Recording, assemble_recording
 from sims.recording.recording_description import (
     DeclaredSignals,
     RecordingDescription,
+    check_description,
     get_floating_state_units,
+    get_model_reference,
 )
+
+Units: TypeAlias = Annotated[
+    Mapping[str, str], Expected("units of columns by their names, as {'q': 'rad'}")
+]
+"""Units of a data frame's columns, by column name."""
 
 
 @runtime_checkable
@@ -314,3 +324,69 @@ class _FrameTable(RecordingTable):
             found_text = "none" if missing[record] else f"{values[record]}"
             self.raise_error(record, column, f"expected a finite number, found {found_text}{note}")
         return values
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameDescription:
+    """System of a recording, and the description of a data frame, which has no `NAME.toml` file.
+
+    Attributes:
+        system: Name of the system, instead of the one that the .toml file states.
+        model: Model file of a robot, MJCF or URDF, instead of what the .toml file states.
+        units: Units of a DataFrame's columns by name (default: those in ``df.attrs["units"]``).
+        constants: Known numbers of the system in SI units, with a DataFrame.
+        description: Any further entries about a DataFrame, with the keys of ``NAME.toml``.
+    """
+
+    system: Name | None = None
+    model: str | Path | None = None
+    units: Units | None = None
+    constants: Mapping[str, float] | None = None
+    description: Mapping[str, Any] | None = None
+
+    def refuse_for_files(self, recording: object) -> None:
+        """Reject a description of a data frame if the recording is a file, which has its own.
+
+        Args:
+            recording: path of the file, for the message.
+
+        Raises:
+            InputError: units, constants or a description are given.
+        """
+        for name in ("units", "constants", "description"):
+            if getattr(self, name):
+                raise InputError(
+                    f"{name}: expected only with a DataFrame; {recording} has a description "
+                    "that states them"
+                )
+
+
+def make_frame_recording(
+    frame: Frame,
+    declared: DeclaredSignals,
+    meta: Mapping[str, Any],
+    units: Mapping[str, str],
+    name: str = "DataFrame",
+) -> Recording:
+    """Make a recording from a data frame, checked as `read_recording` checks files.
+
+    Only the marked runs are held out.
+
+    Args:
+        frame: Data frame with columns ``run`` (for several runs), ``t`` and one for each channel
+            and input.
+        declared: System, or simulator of it.
+        meta: Description of the frame, with the keys of `NAME.toml`.
+        units: Units of columns by name; missing ones are taken from `meta` and
+            ``frame.attrs["units"]``.
+        name: Name of the frame in messages.
+
+    Raises:
+        InputError: The frame is malformed; the message is one line.
+    """
+    path = Path(name)
+    indexed_frame = move_index_to_columns(path, frame)
+    document = build_frame_description(path, indexed_frame, declared, meta, units)
+    description = check_description(path, document, declared)
+    parts = read_frame(path, indexed_frame, description)
+    return assemble_recording(path, parts, description, path, get_model_reference(path, document))

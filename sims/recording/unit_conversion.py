@@ -6,14 +6,11 @@ second, and a plain number as an angle.
 
 from __future__ import annotations
 
-import math
 import re
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from sims.core.simulator import Array, InputError
+from sims.core.simulator import InputError
 
 _MAX_UNIT_LENGTH = 60
 """Maximum number of characters of a unit."""
@@ -145,24 +142,15 @@ def _get_unit_registry() -> Any:
     return registry
 
 
-def unwrapped(positions: Array, command: Array | None = None) -> Array:
-    """Restore the whole turns of an angle that was recorded within one turn; NaN stays NaN.
-
-    Jumps of more than half a turn between samples are removed. The first sample may still be off by
-    whole turns; with a command, the position is moved to the turn of the command.
+def is_convertible(unit: str, target: str) -> bool:
+    """Return whether a unit converts to another one.
 
     Args:
-        positions: (T,) positions, rad.
-        command: (T,) command of the joint's position servo, rad, which the position follows; None
-            if there is none.
-
-    Returns:
-        (T,) positions, rad.
+        unit: name of the unit; an empty one does not convert.
+        target: name of the other unit.
     """
-    result = positions.copy()
-    finite = np.isfinite(positions)
-    result[finite] = np.unwrap(positions[finite])
-    if command is not None and finite.any():
-        mean_difference = float(np.mean((command - result)[finite]))
-        result += 2.0 * math.pi * round(mean_difference / (2.0 * math.pi))
-    return result
+    try:
+        compute_unit_scale(unit, target)
+    except InputError:
+        return False
+    return bool(unit)

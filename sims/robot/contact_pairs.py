@@ -9,13 +9,15 @@ dimension, and `solref` and `solimp` as a mean with the weights `solmix`.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sims.core.simulator import Array, make_unknown_name_error
+from sims.core.simulator import Array, Simulator, make_unknown_name_error
+from sims.recording.recording import Recording
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_model import RobotModel, cache_per_robot
 
@@ -25,6 +27,15 @@ UNNAMED_PREFIX = "simgap."
 """Prefix of the names that are given to unnamed geoms, such as ``simgap.geom3``."""
 MIN_MIX = 1e-15
 """Weight `solmix` below which a geom has no weight (MuJoCo's mjMINVAL)."""
+
+CHECKED_INSTANTS = 100
+"""Maximum number of times of a run at which forces or contacts are evaluated."""
+
+MAX_CONTACTS = 12
+"""Maximum number of contacts at which effects are candidates."""
+
+_STATIC_TREE = -1
+"""Index by which MuJoCo marks bodies that do not move."""
 
 
 class ContactParameters(NamedTuple):
@@ -222,3 +233,150 @@ def add_contact_pairs(robot: RobotModel, pairs: Collection[str]) -> RobotModel:
             **parameters._asdict(),
         )
     return replace(robot, spec=spec)
+
+
+def find_contacts(
+    kind: type[Simulator], positions: Mapping[str, Array]
+) -> frozenset[tuple[int, int]]:
+    """Find pairs of a robot's geoms (collision shapes) that touch during a motion.
+
+    At most `CHECKED_INSTANTS` poses of the motion are evaluated.
+
+    Args:
+        kind: Simulator class of the robot.
+        positions: (N,) position of each joint at N times, rad or m, by channel; other joints keep
+            their initial position.
+
+    Returns:
+        Pairs of the geoms' numbers in MuJoCo, the smaller one first.
+    """
+    pairs: set[tuple[int, int]] = set()
+    for data in iterate_poses(kind, positions):
+        pairs |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}
+    return frozenset(pairs)
+
+
+def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple[str, ...]:
+    """Return the pairs of a robot's geoms (collision shapes) that touch in the recorded poses.
+
+    Joints that are not recorded keep their initial position. Contacts that cannot act on a recorded
+    joint, such as those of an object that rests on a table next to the robot, are left out.
+    Held-out runs are not used.
+
+    Args:
+        recording: Recording of the robot.
+        kind: Simulator class of the robot.
+
+    Returns:
+        Names of at most `MAX_CONTACTS` pairs, the most frequent ones, in alphabetical order.
+    """
+    # This import is needed for robots only.
+
+    model = kind.robot.compiled  # type: ignore[attr-defined]
+    if not can_touch(model):
+        return ()
+    # Number of poses in which a pair of geoms touches.
+    counts = Counter[tuple[int, int]]()
+    for run in recording.training():
+        for data in iterate_poses(kind, run.channels):
+            is_touching = data.contact.dist[: data.ncon] <= 0.0
+            touching_geoms = data.contact.geom[: data.ncon][is_touching]
+            counts.update({(int(min(pair)), int(max(pair))) for pair in touching_geoms})
+    # Kinematic trees (bodies connected by joints) in which some joint is recorded. The index of a
+    # joint's velocity is that of its degree of freedom.
+    recorded_trees = {
+        int(model.dof_treeid[joint.velocity])
+        for run in recording.training()
+        for joint in kind.robot.joints  # type: ignore[attr-defined]
+        if f"q.{joint.name}" in run.channels
+    }
+    acting_pairs = _select_acting_pairs(model, counts, recorded_trees)
+    frequent_pairs = Counter({pair: counts[pair] for pair in acting_pairs}).most_common(
+        MAX_CONTACTS
+    )
+    return tuple(sorted({make_pair_name(model, pair) for pair, _ in frequent_pairs}))
+
+
+def can_touch(model: Any) -> bool:
+    """Return whether any contact can arise in a compiled model.
+
+    Args:
+        model: compiled model (mujoco.MjModel).
+    """
+    # These imports are needed for robots only.
+    import mujoco
+
+    from sims.robot.parsing.collision_filters import can_collide
+
+    is_disabled = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return not is_disabled and can_collide(model)
+
+
+def _select_acting_pairs(
+    model: Any, pairs: Iterable[tuple[int, int]], recorded_trees: Collection[int]
+) -> list[tuple[int, int]]:
+    """Return the pairs of geoms whose contact can act on a recorded joint.
+
+    A force is passed on within a kinematic tree (bodies connected by joints), and from tree to tree
+    at a contact, but not by a body that does not move. Starting from the recorded trees, further
+    trees are added until none is reached by a contact any more.
+
+    Args:
+        model: Compiled model (mujoco.MjModel).
+        pairs: Pairs of geoms that touch.
+        recorded_trees: Kinematic trees (`MjModel.body_treeid`) with recorded joints.
+
+    Returns:
+        The pairs in their order.
+    """
+    trees_by_pair = {
+        pair: {int(model.body_treeid[model.geom_bodyid[geom]]) for geom in pair} - {_STATIC_TREE}
+        for pair in pairs
+    }
+    reached = set(recorded_trees)
+    while True:
+        acting = [pair for pair, trees in trees_by_pair.items() if trees & reached]
+        newly_reached = reached.union(*(trees_by_pair[pair] for pair in acting))
+        if newly_reached == reached:
+            return acting
+        reached = newly_reached
+
+
+def iterate_poses(
+    kind: type[Simulator], positions: Mapping[str, Array], inputs: Mapping[str, Array] | None = None
+) -> Iterator[Any]:
+    """Yield MuJoCo's data (mujoco.MjData) of a robot at rest at some of its recorded poses.
+
+    Up to `CHECKED_INSTANTS` poses are evaluated, evenly spaced over the samples. The same object is
+    yielded each time, with the contacts and accelerations of the next pose.
+
+    Args:
+        kind: simulator class of the robot.
+        positions: (T,) positions by channel ``q.JOINT``, rad or m; joints without one, and missing
+            samples, have the initial position.
+        inputs: (T,) inputs by name; those that are missing are zero.
+    """
+    import mujoco
+
+    robot = kind.robot  # type: ignore[attr-defined]
+    inputs = inputs or {}
+    model = robot.compiled
+    data = mujoco.MjData(model)
+    joints = [joint for joint in robot.joints if joint.has_one_coordinate]
+    sample_count = max((values.size for values in positions.values()), default=0)
+    samples = np.unique(np.linspace(0, max(sample_count - 1, 0), CHECKED_INSTANTS).astype(np.intp))
+    with capture_mujoco_warnings():
+        for sample in samples:
+            mujoco.mj_resetData(model, data)
+            # `position`, `velocity` and `control` are indices into MuJoCo's arrays.
+            for joint in joints:
+                values = positions.get(f"q.{joint.name}")
+                if values is not None and np.isfinite(values[sample]):
+                    data.qpos[joint.position] = values[sample]
+                if f"force.{joint.name}" in inputs:
+                    data.qfrc_applied[joint.velocity] = inputs[f"force.{joint.name}"][sample]
+            for actuator in robot.actuators:
+                if f"u.{actuator.name}" in inputs:
+                    data.ctrl[actuator.control] = inputs[f"u.{actuator.name}"][sample]
+            mujoco.mj_forward(model, data)
+            yield data

@@ -24,6 +24,9 @@ COUPLING_PLACEHOLDER = ("", COUPLING_EFFECT)
 One model has a tendon for each drive that can be coupled; c is zero where none is.
 """
 
+COUPLING_FIELD = "wrap_prm"
+"""Model field of coupling coefficients, which a model without tendons lacks."""
+
 
 def find_preceding_joint(robot: RobotModel, name: str) -> Joint | None:
     """Find the preceding joint, in the joint's own body or in the nearest ancestor with joints.
@@ -107,3 +110,16 @@ def make_coupled_robot(robot: RobotModel, coefficients: Mapping[str, float]) -> 
                     actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
                     actuator.ctrlrange = robot.compiled.actuator_ctrlrange[actuator.id]
     return replace(robot, spec=spec, coupled=tuple(coefficients))
+
+
+def get_coupling_address(robot: RobotModel, place: str) -> int:
+    """Return the address in `wrap_prm` of the coupling coefficient of a joint's drive.
+
+    Args:
+        robot: robot with coupled drives.
+        place: joint of the drive.
+    """
+    model = robot.compiled
+    tendon = model.tendon(place + COUPLING_TENDON_SUFFIX).id
+    # The tendon lists the drive's own joint with the coefficient 1, then the preceding joint.
+    return int(model.tendon_adr[tendon]) + 1

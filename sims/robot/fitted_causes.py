@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sims.core.effect import ALL_PLACES
-from sims.core.plain_values import append_unit
 from sims.core.simulator import Array
-from sims.extended_simulator import FittedValue
-from sims.robot.integrator_settings import OPTION_EFFECTS, format_option
+from sims.core.user_messages import append_unit
+from sims.extended_simulator import ExtendedSimulator, FittedValue
 
 if TYPE_CHECKING:
     from sims.robot.robot_model import RobotModel
@@ -31,6 +30,9 @@ MAX_COMPENSATED_GRAVITY_SHARE = 0.02
 
 GRAVITY_COMPENSATED = "gravity is compensated: the real robot or its controller carries its weight"
 """Text for a gravity correction that removes gravity completely."""
+
+CauseCoefficients = Mapping[str, Mapping[str, FittedValue]]
+"""Coefficients by ``effect@place``, ``effect@*`` or ``effect``."""
 
 
 def is_gravity_compensated(effect: str, numbers: Mapping[str, FittedValue]) -> bool:
@@ -87,6 +89,9 @@ class FittedCause:
         Args:
             recording: Name of the recording for the text; empty to leave it out.
         """
+        # This import is needed for robots only.
+        from sims.robot.integrator_settings import OPTION_EFFECTS, format_option
+
         has_several = len(self.numbers) > 1
         origin_text = f", fitted to {recording}" if recording else ""
         if self.effect in OPTION_EFFECTS:
@@ -184,3 +189,54 @@ def _list_places(robot: RobotModel, effect: str) -> list[str]:
     if effect.startswith("sensor."):
         return [ALL_PLACES]
     return [joint.name for joint in robot.joints]
+
+
+def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, FittedValue]]:
+    """Collect the fitted changes of a robot as coefficients by effect.
+
+    They are numbers of its model file that the user freed for the fit, diagnosed effects, and the
+    time step and other options of the integrator if they differ from those of the file.
+
+    Args:
+        extended: extended simulator of a robot, with the fitted values.
+    """
+    kind: Any = extended.kind
+    causes: dict[str, Mapping[str, FittedValue]] = {}
+    for effect in kind.system.freed_effects:
+        names = [coefficient.name for coefficient in effect.coefficients]
+        # A freed number is a parameter with the name of its effect, and of its coefficient if there
+        # are several.
+        parameters = (
+            [effect.name] if len(names) == 1 else [f"{effect.name}.{name}" for name in names]
+        )
+        causes[effect.name] = {
+            name: extended.parameters[parameter]
+            for name, parameter in zip(names, parameters, strict=True)
+        }
+    return {**causes, **extended.effects, **_list_numerics_causes(kind)}
+
+
+def _list_numerics_causes(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
+    """Return the options of the model as causes, if they differ from those of the model file.
+
+    The step is in seconds; an option that is a word in the file has its MuJoCo number. They have no
+    intervals because they are chosen, not fitted.
+    """
+    from sims.robot.integrator_settings import list_changed_options
+
+    return {
+        effect: {effect.removeprefix("numerics."): make_option_value(effect, *numbers)}
+        for effect, numbers in list_changed_options(kind.robot, kind.numerics).items()
+    }
+
+
+def make_option_value(effect: str, stated: float, number: float) -> FittedValue:
+    """Return the value of a changed option of the model file, which is chosen and has no interval.
+
+    Args:
+        effect: Effect that names the option, such as ``numerics.impratio``.
+        stated: Number in the model file.
+        number: Number that replaces it.
+    """
+    unit = "s" if effect == "numerics.step" else "1"
+    return FittedValue(float(number), unit, None, None, stated=float(stated), total=float(number))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, cast
 
 from sims.core import toml_validation
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.robot.parsing.floating_bases import fix_bases
+from sims.robot.robot_model import RobotModel
 
 if TYPE_CHECKING:
     from sims.robot.robot_model import RobotModel
@@ -222,3 +224,21 @@ def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> l
             raise InputError(f"{source}: engine: {error}")
         spec.option.integrator = INTEGRATOR_IDS[name]
     return fix_bases(spec) if settings.get("fix_base") else []
+
+
+def with_integrator_settings(robot: RobotModel, settings: Mapping[str, float]) -> RobotModel:
+    """Return the robot with other options of its model; the robot itself if they are equal.
+
+    Args:
+        robot: robot whose model has options already.
+        settings: wanted options by name, such as ``timestep``, as numbers.
+    """
+    compiled_options = robot.compiled.opt
+    if all(getattr(compiled_options, name) == value for name, value in settings.items()):
+        return robot
+    spec = robot.spec.copy()
+    for name, value in settings.items():
+        # An option that is an integer in the compiled model must be set to an integer.
+        option_type = type(getattr(compiled_options, name))
+        setattr(spec.option, name, option_type(value))
+    return replace(robot, spec=spec)

@@ -31,16 +31,19 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sims.core.effect import ActiveEffects, Effect
 from sims.core.simulator import Array
 from sims.robot.contact_pairs import find_geom, find_pair
+from sims.robot.coupled_drives import COUPLING_FIELD, get_coupling_address
 from sims.robot.dry_friction import write_friction_form
+from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.inertia_tensors import (
     compute_inertia_tensors,
     compute_point_inertias,
     compute_principal_axes,
 )
 from sims.robot.places.observable_axes import observable_tilts
-from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
+from sims.robot.robot_model import RobotModel
 
 MIN_FACTOR = 1e-6
 """Minimum factor of a mass or a gain, so that none becomes zero or negative."""
@@ -343,19 +346,6 @@ def _tilt_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
     fields["opt.gravity"][:, :2] += size * c.T  # (4)
 
 
-def get_coupling_address(robot: RobotModel, place: str) -> int:
-    """Return the address in `wrap_prm` of the coupling coefficient of a joint's drive.
-
-    Args:
-        robot: robot with coupled drives.
-        place: joint of the drive.
-    """
-    model = robot.compiled
-    tendon = model.tendon(place + COUPLING_TENDON_SUFFIX).id
-    # The tendon lists the drive's own joint with the coefficient 1, then the preceding joint.
-    return int(model.tendon_adr[tendon]) + 1
-
-
 def _set_coupling(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     fields["wrap_prm"][:, get_coupling_address(robot, place)] = c[0]
 
@@ -542,8 +532,6 @@ def _make_solref_writer(index: int) -> FieldWriter:
     return write
 
 
-COUPLING_FIELD = "wrap_prm"
-"""Model field of coupling coefficients, which a model without tendons lacks."""
 CONTACT_FIELDS = frozenset({"pair_friction", "pair_solref"})
 """Model fields of pairs of geoms, which a model without elements `<pair>` lacks."""
 _SERVO_FIELDS = ("actuator_gainprm", "actuator_biasprm")
@@ -691,3 +679,26 @@ def model_fields(robot: RobotModel, effect: str, place: str) -> list[list[ModelF
 def operation_of(effect: str) -> Operation:
     """Return how a random number is applied to the field of an effect."""
     return MODEL_FIELD_EFFECTS[effect].operation if effect in MODEL_FIELD_EFFECTS else "abs"
+
+
+def is_model_field_effect(effect: Effect) -> bool:
+    """Return whether the engine writes the effect into fields of the MuJoCo model."""
+    has_field = (effect.of or effect.name) in MODEL_FIELD_EFFECTS
+    return is_series_effect(effect) or (has_field and effect.hook in ("value", "force", "contact"))
+
+
+def changes_derived_constants(effect: Effect) -> bool:
+    """Return whether MuJoCo derives constants from the model fields that the effect changes.
+
+    An example is a mass, from which MuJoCo derives inverse weights of bodies and joints. An effect
+    at one place has the name of the registered effect in `of`.
+    """
+    return is_model_field_effect(effect) and (
+        is_series_effect(effect)
+        or MODEL_FIELD_EFFECTS[effect.of or effect.name].changes_derived_constants
+    )
+
+
+def select_model_field_effects(acting: ActiveEffects) -> ActiveEffects:
+    """Select the effects that are written into fields of the MuJoCo model."""
+    return tuple((e, c) for e, c in acting if is_model_field_effect(e))

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-from sims.core.plain_values import truncate_text
+from sims.core.user_messages import truncate_text
 
 
 @contextmanager

@@ -29,11 +29,9 @@ from sims.robot.dynamics.activation_filters import (
     select_initial_activations,
 )
 from sims.robot.dynamics.active_effects import (
-    changes_derived_constants,
     find_active_elements,
     is_evaluated_per_step,
     pad_coefficients,
-    select_model_field_effects,
     slice_active_effects,
 )
 from sims.robot.dynamics.added_elements import AddedElements, group_by_added_elements
@@ -59,10 +57,9 @@ from sims.robot.dynamics.run_batches import (
     BatchStart,
     RobotRunBatch,
     group_by_run,
-    list_last_read_times,
     split_into_batches,
 )
-from sims.robot.dynamics.sensor_sampling import sample_readings
+from sims.robot.dynamics.sensor_sampling import list_last_read_times, sample_readings
 from sims.robot.dynamics.stepping_with_forces import step_with_forces
 from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.integrator_settings import (
@@ -72,6 +69,7 @@ from sims.robot.integrator_settings import (
     RobotEngine,
     read_integrator_settings,
 )
+from sims.robot.model_field_effects import changes_derived_constants, select_model_field_effects
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_model import FrictionForm, RobotModel
 from sims.robot.robot_system import RobotSystem, make_robot_system

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from sims.core.plain_values import GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE
+from sims.core.number_limits import GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE
 from sims.core.simulator import Array, Channel, Constant, Parameter
 from sims.core.system import DefaultRecording, StateSnapshot, System, SystemKind
 from sims.system_simulator import SystemSimulator

@@ -22,7 +22,13 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sims.core.effect import Effect
-from sims.core.plain_values import ANGLE_RANGE, GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE, RATIO_RANGE
+from sims.core.number_limits import (
+    ANGLE_RANGE,
+    GRAVITY_RANGE,
+    LENGTH_RANGE,
+    MASS_RANGE,
+    RATIO_RANGE,
+)
 from sims.core.simulator import Array, Channel, Constant, Parameter
 from sims.core.system import StateSnapshot, System, SystemKind
 from sims.system_simulator import SystemSimulator

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from sims.core.effect import Effect
-from sims.core.plain_values import (
+from sims.core.number_limits import (
     GAIN_RANGE,
     GRAVITY_RANGE,
     LENGTH_RANGE,

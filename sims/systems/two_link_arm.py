@@ -28,7 +28,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from sims.core.plain_values import GRAVITY_RANGE, INERTIA_RANGE, LENGTH_RANGE
+from sims.core.number_limits import GRAVITY_RANGE, INERTIA_RANGE, LENGTH_RANGE
 from sims.core.simulator import Channel, Constant, Parameter
 from sims.engines.external.bullet_world import NO_LIMIT
 from sims.own_simulator import BulletWorld, OwnSimulator

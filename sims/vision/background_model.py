@@ -21,6 +21,10 @@ _LARGEST_OF_THREE_RATIO = 1.5
 """Assumed ratio of the largest of three noise magnitudes to a single one."""
 
 
+MIN_EMPTY_FRAMES = 3
+"""Minimum number of frames without an object that prove that it is in the background estimate."""
+
+
 def select_frames(moved: Array) -> list[int]:
     """Select the frames whose median is the background: at even intervals of accumulated motion.
 

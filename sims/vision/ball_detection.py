@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.simulator import Array
-from sims.vision import circle_fit
+from sims.vision import background_model, circle_fit
+from sims.vision.background_model import MIN_EMPTY_FRAMES
 from sims.vision.ball_renderer import RgbImage
+from sims.vision.circle_fit import Circle
 from sims.vision.video_files import import_package
 
 _RAY_COUNT = 36
@@ -85,6 +87,18 @@ _SMALL_BALL_MARGIN = 2.5
 """Distance from the edge of a small ball, in pixels, within which pixels are summed."""
 _CENTRE_PATCH_SHARE = 0.4
 """Half width of the patch that shows the colour of a ball, as a share of its radius."""
+
+_COMPARED_FRAMES = 8
+"""Approximate number of frames on which both treatments of shadows are compared."""
+
+_MIN_SHADOW_REMOVAL_RATIO = 0.8
+"""Minimum ratio of the ray agreement with and without shadow removal at which it is used."""
+
+_SAME_CENTRE_SHARE = 0.3
+"""Distance of the centres of two circles at rest that are one object, as a share of the radius."""
+
+_SAME_RADIUS_RATIOS = (0.7, 1.4)
+"""Ratios of the radii of two circles between which they may be one object."""
 
 
 class BallDetection(NamedTuple):
@@ -623,3 +637,114 @@ def _compute_ray_directions() -> tuple[Array, Array]:
     """Return the cosines and sines (rays, 1) of the ray directions."""
     angles = np.linspace(0, 2 * np.pi, _RAY_COUNT, endpoint=False)[:, None]
     return np.cos(angles), np.sin(angles)
+
+
+def make_detector(pictures: list[RgbImage]) -> BallDetector:
+    """Make a detector of balls, with a background estimated from some pictures.
+
+    The background is first the median of the pictures. Twice, the objects are detected with it, and
+    it is estimated again without the pixels that they hide. The detector removes shadows if about
+    as many round objects are found with that as without.
+
+    Args:
+        pictures: Some pictures (height, width, 3) of the film.
+    """
+    background = background_model.compute_median_background(pictures)
+    # Both treatments of shadows are compared on some of the pictures.
+    stride = max(1, len(pictures) // _COMPARED_FRAMES)
+    # Two passes: objects hidden by the first background are detected with the second.
+    for _ in range(2):
+        sigma = background_model.estimate_camera_noise(pictures, background)
+        shadow_detector = BallDetector(background, sigma, shadows=True)
+        plain_detector = BallDetector(background, sigma, shadows=False)
+        shadow_detections = [shadow_detector.detect(p, ghosts=True) for p in pictures[::stride]]
+        plain_detections = [plain_detector.detect(p, ghosts=True) for p in pictures[::stride]]
+        # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
+        min_roundness = _MIN_SHADOW_REMOVAL_RATIO * _compute_roundness(plain_detections)
+        if _compute_roundness(shadow_detections) >= min_roundness:
+            detector, known_detections = shadow_detector, shadow_detections
+        else:
+            detector, known_detections = plain_detector, plain_detections
+        detections = []
+        for i, picture in enumerate(pictures):
+            if i % stride == 0:
+                detections.append(known_detections[i // stride])
+            else:
+                detections.append(detector.detect(picture, ghosts=True))
+        hiding_circles = list_hiding_circles(detections)
+        shadow_masks = None
+        if detector.shadows:
+            # If a shadow of the background is missing in some pictures, these show the true
+            # background; the shadow hides it in the others.
+            is_lit = np.stack([detector.find_missing_shadow(picture) for picture in pictures])
+            shadow_masks = ~is_lit & (is_lit.sum(axis=0) >= MIN_EMPTY_FRAMES)
+        background = background_model.compute_masked_background(
+            pictures, hiding_circles, background, shadow_masks
+        )
+    return BallDetector(background, sigma, detector.shadows)
+
+
+def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
+    """Return how round the detected objects are: the sum over pictures of the best ray agreement.
+
+    The ray agreement of a detection is the fraction of rays from its centre that meet the edge on
+    a circle.
+
+    Args:
+        pictures: Detections in each picture; ghosts (objects in the background image that the
+            picture lacks) do not count.
+    """
+    return sum(
+        max(
+            (detection.ray_agreement for detection in detections if not detection.is_ghost),
+            default=0.0,
+        )
+        for detections in pictures
+    )
+
+
+def list_hiding_circles(detections: list[list[BallDetection]]) -> list[list[Circle]]:
+    """Return the circles that hide the true background in each picture.
+
+    They are the detected objects, and objects in the present estimate of the background: a ball
+    that rests for most of the film, or its shadow, is part of the median. In pictures without it,
+    it is detected as a ghost; these show the true background, and all others are hidden there.
+
+    Args:
+        detections: Detections in each picture, including ghosts.
+    """
+    hiding_circles: list[list[Circle]] = []
+    ghosts: list[list[Circle]] = []
+    for picture_detections in detections:
+        hiding_circles.append([(d.u, d.v, d.radius) for d in picture_detections if not d.is_ghost])
+        ghosts.append([(d.u, d.v, d.radius) for d in picture_detections if d.is_ghost])
+    for ghost in [circle for circles in ghosts for circle in circles]:
+        # Whether the object is missing in each picture.
+        are_without_object = [
+            any(_is_same_object(ghost, circle) for circle in circles) for circles in ghosts
+        ]
+        # In one or two pictures it may be missed by mistake.
+        if sum(are_without_object) < MIN_EMPTY_FRAMES:
+            continue
+        for circles, is_without_object in zip(hiding_circles, are_without_object, strict=True):
+            if not is_without_object:
+                circles.append(ghost)
+    return hiding_circles
+
+
+def _is_same_object(a: Circle, b: Circle) -> bool:
+    """Return whether two circles are the same object at rest.
+
+    The distance of their centres (sum of both coordinates) may be `_SAME_CENTRE_SHARE` of the
+    radius and half a pixel, and their radii may differ by `_SAME_RADIUS_RATIOS`.
+
+    Args:
+        a: centre and radius of one circle, pixels.
+        b: centre and radius of the other one.
+    """
+    u, v, radius = a
+    other_u, other_v, other_radius = b
+    distance = abs(u - other_u) + abs(v - other_v)
+    min_ratio, max_ratio = _SAME_RADIUS_RATIOS
+    is_near = distance < _SAME_CENTRE_SHARE * other_radius + 0.5
+    return is_near and min_ratio < radius / other_radius < max_ratio

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from sims.core.noise_estimation import NOISE_WINDOW_SAMPLES, estimate_roughness
 from sims.core.simulator import Array, InputError
 from sims.vision import background_model, film_cuts
-from sims.vision.ball_detection import BallDetection, BallDetector
+from sims.vision.ball_detection import BallDetection, BallDetector, make_detector
 from sims.vision.ball_renderer import RgbImage
-from sims.vision.circle_fit import Circle
+from sims.vision.video_files import FrameCache
 
 _MAX_MISSED_FRAMES = 15
 """Maximum number of consecutive frames in which an object may be missed."""
@@ -36,14 +36,8 @@ _CHROMA_BLUR_PIXELS = 1.5
 
 Video files store colours at half the resolution.
 """
-_SAME_CENTRE_SHARE = 0.3
-"""Distance of the centres of two circles at rest that are one object, as a share of the radius."""
-_SAME_RADIUS_RATIOS = (0.7, 1.4)
-"""Ratios of the radii of two circles between which they may be one object."""
 _SIMILAR_RADIUS_RATIOS = (0.4, 2.5)
 """Ratios of the radii of two moving objects between which they may be taken for each other."""
-_MIN_MOTION_SHARE = 1e-3
-"""Smallest motion per sample of a window for the noise estimate, as a share of the travel."""
 
 
 @dataclass
@@ -293,18 +287,8 @@ def _compute_median_distance(line: Array, points: Array) -> float:
     return float(np.median(np.abs(distances)))
 
 
-_NOISE_WINDOW_SAMPLES = 9
-"""Length in samples of the windows for noise estimation; shorter paths are not smoothed."""
-_COMPARED_FRAMES = 8
-"""Approximate number of frames on which both treatments of shadows are compared."""
-_MAX_CACHED_BYTES = 200_000_000
-"""Maximum number of bytes of frames that are cached in memory."""
-_MIN_EMPTY_FRAMES = 3
-"""Minimum number of frames without an object that prove that it is in the background estimate."""
 _MAX_RADIUS_DEVIATION = 0.2
 """Maximum relative deviation of a radius from the linear trend along its path."""
-_MIN_SHADOW_REMOVAL_RATIO = 0.8
-"""Minimum ratio of the ray agreement with and without shadow removal at which it is used."""
 _REWEIGHTING_ITERATIONS = 10
 """Number of iterations of reweighted least squares."""
 _MIN_RADIUS_UNCERTAINTY = 0.02
@@ -356,7 +340,7 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     Raises:
         InputError: No ball is found, or the part without a cut is too short.
     """
-    frames = _FrameCache(frames)
+    frames = FrameCache(frames)
     survey = film_cuts.survey_frames(frames)
     notes: list[str] = []
     first_frame, end_frame = film_cuts.find_longest_shot(survey, notes)
@@ -365,7 +349,7 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     ]
     sample_set = set(sample_frames)
     pictures = [picture for number, (_, picture) in enumerate(frames) if number in sample_set]
-    detector = _make_detector(pictures)
+    detector = make_detector(pictures)
     # Detections in each frame of the part without a cut.
     detections = []
     for number, (_, picture) in enumerate(frames):
@@ -391,36 +375,6 @@ def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     )
 
 
-class _FrameCache:
-    """Frames that are cached if they are few and small, and otherwise read again each time."""
-
-    def __init__(self, source: Iterable[tuple[float, RgbImage]]) -> None:
-        self._source = source
-        self._cached_frames: list[tuple[float, RgbImage]] | None = None
-
-    def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
-        """Yield time and picture of each frame, and store the frames in the first full pass.
-
-        More than `_MAX_CACHED_BYTES` bytes of pictures are not stored, and the film is read again
-        in each pass.
-        """
-        if self._cached_frames is not None:
-            yield from self._cached_frames
-            return
-        frames = []
-        stored_bytes = 0
-        for time, picture in self._source:
-            stored_bytes += picture.nbytes
-            if stored_bytes <= _MAX_CACHED_BYTES:
-                frames.append((time, picture))
-            else:
-                # Too many frames: release those cached so far at once.
-                frames.clear()
-            yield time, picture
-        if stored_bytes <= _MAX_CACHED_BYTES:
-            self._cached_frames = frames
-
-
 def _format_no_ball_message(frames: int, frames_with_objects: int) -> str:
     """Format the message that no ball was found.
 
@@ -435,117 +389,6 @@ def _format_no_ball_message(frames: int, frames_with_objects: int) -> str:
         f"no ball found: {observation} that moves and stays round; "
         "film with a fixed camera and a ball unlike its background"
     )
-
-
-def _make_detector(pictures: list[RgbImage]) -> BallDetector:
-    """Make a detector of balls, with a background estimated from some pictures.
-
-    The background is first the median of the pictures. Twice, the objects are detected with it, and
-    it is estimated again without the pixels that they hide. The detector removes shadows if about
-    as many round objects are found with that as without.
-
-    Args:
-        pictures: Some pictures (height, width, 3) of the film.
-    """
-    background = background_model.compute_median_background(pictures)
-    # Both treatments of shadows are compared on some of the pictures.
-    stride = max(1, len(pictures) // _COMPARED_FRAMES)
-    # Two passes: objects hidden by the first background are detected with the second.
-    for _ in range(2):
-        sigma = background_model.estimate_camera_noise(pictures, background)
-        shadow_detector = BallDetector(background, sigma, shadows=True)
-        plain_detector = BallDetector(background, sigma, shadows=False)
-        shadow_detections = [shadow_detector.detect(p, ghosts=True) for p in pictures[::stride]]
-        plain_detections = [plain_detector.detect(p, ghosts=True) for p in pictures[::stride]]
-        # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
-        min_roundness = _MIN_SHADOW_REMOVAL_RATIO * _compute_roundness(plain_detections)
-        if _compute_roundness(shadow_detections) >= min_roundness:
-            detector, known_detections = shadow_detector, shadow_detections
-        else:
-            detector, known_detections = plain_detector, plain_detections
-        detections = []
-        for i, picture in enumerate(pictures):
-            if i % stride == 0:
-                detections.append(known_detections[i // stride])
-            else:
-                detections.append(detector.detect(picture, ghosts=True))
-        hiding_circles = _list_hiding_circles(detections)
-        shadow_masks = None
-        if detector.shadows:
-            # If a shadow of the background is missing in some pictures, these show the true
-            # background; the shadow hides it in the others.
-            is_lit = np.stack([detector.find_missing_shadow(picture) for picture in pictures])
-            shadow_masks = ~is_lit & (is_lit.sum(axis=0) >= _MIN_EMPTY_FRAMES)
-        background = background_model.compute_masked_background(
-            pictures, hiding_circles, background, shadow_masks
-        )
-    return BallDetector(background, sigma, detector.shadows)
-
-
-def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
-    """Return how round the detected objects are: the sum over pictures of the best ray agreement.
-
-    The ray agreement of a detection is the fraction of rays from its centre that meet the edge on
-    a circle.
-
-    Args:
-        pictures: Detections in each picture; ghosts (objects in the background image that the
-            picture lacks) do not count.
-    """
-    return sum(
-        max(
-            (detection.ray_agreement for detection in detections if not detection.is_ghost),
-            default=0.0,
-        )
-        for detections in pictures
-    )
-
-
-def _list_hiding_circles(detections: list[list[BallDetection]]) -> list[list[Circle]]:
-    """Return the circles that hide the true background in each picture.
-
-    They are the detected objects, and objects in the present estimate of the background: a ball
-    that rests for most of the film, or its shadow, is part of the median. In pictures without it,
-    it is detected as a ghost; these show the true background, and all others are hidden there.
-
-    Args:
-        detections: Detections in each picture, including ghosts.
-    """
-    hiding_circles: list[list[Circle]] = []
-    ghosts: list[list[Circle]] = []
-    for picture_detections in detections:
-        hiding_circles.append([(d.u, d.v, d.radius) for d in picture_detections if not d.is_ghost])
-        ghosts.append([(d.u, d.v, d.radius) for d in picture_detections if d.is_ghost])
-    for ghost in [circle for circles in ghosts for circle in circles]:
-        # Whether the object is missing in each picture.
-        are_without_object = [
-            any(_is_same_object(ghost, circle) for circle in circles) for circles in ghosts
-        ]
-        # In one or two pictures it may be missed by mistake.
-        if sum(are_without_object) < _MIN_EMPTY_FRAMES:
-            continue
-        for circles, is_without_object in zip(hiding_circles, are_without_object, strict=True):
-            if not is_without_object:
-                circles.append(ghost)
-    return hiding_circles
-
-
-def _is_same_object(a: Circle, b: Circle) -> bool:
-    """Return whether two circles are the same object at rest.
-
-    The distance of their centres (sum of both coordinates) may be `_SAME_CENTRE_SHARE` of the
-    radius and half a pixel, and their radii may differ by `_SAME_RADIUS_RATIOS`.
-
-    Args:
-        a: centre and radius of one circle, pixels.
-        b: centre and radius of the other one.
-    """
-    u, v, radius = a
-    other_u, other_v, other_radius = b
-    distance = abs(u - other_u) + abs(v - other_v)
-    min_ratio, max_ratio = _SAME_RADIUS_RATIOS
-    is_near = distance < _SAME_CENTRE_SHARE * other_radius + 0.5
-    return is_near and min_ratio < radius / other_radius < max_ratio
 
 
 def _note_other_objects(
@@ -611,7 +454,7 @@ def _make_track(
             f"{missing_count} of {len(times)} frames show no measurable ball; their cells are empty"
         )
     noise = np.nan
-    if len(times) > _NOISE_WINDOW_SAMPLES:
+    if len(times) > NOISE_WINDOW_SAMPLES:
         noise = max(estimate_roughness(u), estimate_roughness(v))
     # If the path is too short or at rest, use the distance of the edges from their circles.
     if not (np.isfinite(noise) and noise > 0):
@@ -641,7 +484,7 @@ def _refine_with_smooth_radius(
         The refitted detections, and whether the radius of each deviates too much from the linear
         trend, which means that another object was measured.
     """
-    if len(detections) < _NOISE_WINDOW_SAMPLES:
+    if len(detections) < NOISE_WINDOW_SAMPLES:
         return detections, [False] * len(detections)
     centres = np.array([(detection.u, detection.v) for detection in detections])
     offsets = centres - centres.mean(axis=0)
@@ -665,37 +508,3 @@ def _refine_with_smooth_radius(
     is_wrong = np.abs(radius - fitted) > tolerance
     refitted = [s.refit_with_radius(float(r)) for s, r in zip(detections, fitted, strict=True)]
     return refitted, is_wrong.tolist()
-
-
-def estimate_roughness(values: Array) -> float:
-    """Estimate the noise of a signal from the residuals of local cubic fits.
-
-    A cubic is fitted to each window of `_NOISE_WINDOW_SAMPLES` samples in which the signal moves.
-    Windows with gaps are skipped, and the median makes the result insensitive to bounces.
-
-    Args:
-        values: (T,) signal, NaN where missing.
-
-    Returns:
-        Standard deviation of the noise; NaN if the signal is too short or never moves.
-    """
-    if len(values) < _NOISE_WINDOW_SAMPLES:
-        return float("nan")
-    windows = sliding_window_view(values, _NOISE_WINDOW_SAMPLES)
-    windows = windows[np.isfinite(windows).all(axis=1)]
-    if not len(windows):
-        return float("nan")
-    # At rest the same pixels give the same error again and again, which is no scatter.
-    finite_values = values[np.isfinite(values)]
-    travel = max(float(np.ptp(finite_values)), 1e-12)
-    min_motion = _MIN_MOTION_SHARE * travel * _NOISE_WINDOW_SAMPLES
-    windows = windows[np.ptp(windows, axis=1) > min_motion]
-    if not len(windows):
-        return float("nan")
-    # A cubic has four coefficients, which reduces the degrees of freedom by four. With an
-    # orthonormal basis of cubics, the fit is a projection.
-    cubic = np.vander(np.linspace(-1, 1, _NOISE_WINDOW_SAMPLES), 4)
-    basis, _ = np.linalg.qr(cubic)
-    residuals = windows - windows @ basis @ basis.T
-    squares = (residuals**2).sum(axis=1)
-    return float(np.sqrt(np.median(squares) / (_NOISE_WINDOW_SAMPLES - 4)))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sims.core.plain_values import ANGLE_RANGE, IMAGE_SIZE_RANGE, LENGTH_RANGE
+from sims.core.number_limits import ANGLE_RANGE, IMAGE_SIZE_RANGE, LENGTH_RANGE
 from sims.core.simulator import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
 from sims.systems.ball import Ball, BallSystem
 from sims.vision import video_files

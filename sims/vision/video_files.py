@@ -23,6 +23,9 @@ from sims.vision.ball_renderer import RgbImage
 REQUIRED_PACKAGES = ("av", "cv2")
 """Packages for films: PyAV reads and writes video files, OpenCV measures pictures."""
 
+_MAX_CACHED_BYTES = 200_000_000
+"""Maximum number of bytes of frames that are cached in memory."""
+
 
 def check_installed(instead: str = "") -> None:
     """Check that the packages for films are installed, without importing them.
@@ -308,3 +311,33 @@ def _describe_unreadable_file(path: Path) -> str:
         return "is truncated before its index, so no frame can be read; copy the whole file again"
     text = all(32 <= byte < 127 or byte in b"\t\r\n" for byte in start)
     return f"expected a video, found {'a text file' if text else 'something else'}"
+
+
+class FrameCache:
+    """Frames that are cached if they are few and small, and otherwise read again each time."""
+
+    def __init__(self, source: Iterable[tuple[float, RgbImage]]) -> None:
+        self._source = source
+        self._cached_frames: list[tuple[float, RgbImage]] | None = None
+
+    def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
+        """Yield time and picture of each frame, and store the frames in the first full pass.
+
+        More than `_MAX_CACHED_BYTES` bytes of pictures are not stored, and the film is read again
+        in each pass.
+        """
+        if self._cached_frames is not None:
+            yield from self._cached_frames
+            return
+        frames = []
+        stored_bytes = 0
+        for time, picture in self._source:
+            stored_bytes += picture.nbytes
+            if stored_bytes <= _MAX_CACHED_BYTES:
+                frames.append((time, picture))
+            else:
+                # Too many frames: release those cached so far at once.
+                frames.clear()
+            yield time, picture
+        if stored_bytes <= _MAX_CACHED_BYTES:
+            self._cached_frames = frames

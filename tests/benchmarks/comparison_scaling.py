@@ -16,14 +16,15 @@ from time import perf_counter
 
 import numpy as np
 
-from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS, write_report
+from bench.benchmark.comparison_report import write_report
 from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.runner.experiment_runner import prepare_experiment
 from bench.benchmark.runner.run_in_worker import RunOutcome
-from bench.benchmark.runner.run_scoring import build_rows, make_status
+from bench.benchmark.runner.run_result_rows import build_rows, make_status
 from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.runner.tuner_loop import RunTrace
 from bench.benchmark.runner.worker_pools import LocalPool
+from bench.benchmark.statistics.comparison_statistics import REQUIRED_RUN_COLUMNS
 from bench.benchmark.storage.result_folder import read_comparison, write_results
 from bench.benchmark.storage.run_journal import RunJournal
 from bench.core.plugin_registries import load_plugins

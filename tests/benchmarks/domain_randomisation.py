@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.problem.experiment import load_experiment
-from bench.benchmark.problem.experiment_tables import TunerEntry
-from bench.benchmark.problem.recording_observations import ObservedRuns
+from bench.benchmark.problem.experiment_config import TunerEntry, load_experiment
+from bench.benchmark.problem.experiment_recording import ObservedRuns
 from bench.benchmark.problem.training_simulator import RandomisedSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run

@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
+from bench.diagnosis.evaluation.autoregressive_surrogates import draw_surrogates
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
 from bench.diagnosis.explain import explain
+from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
 from bench.diagnosis.pipeline import simulated_runs
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.score_test import ScoreTest

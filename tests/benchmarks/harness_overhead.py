@@ -15,11 +15,11 @@ from time import perf_counter
 
 import numpy as np
 
-from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.problem.tuning_problem import ProposalEvaluator, TuningProblem
 from bench.benchmark.runner.run_in_worker import RunOutcome, RunRequest
-from bench.benchmark.runner.run_scoring import build_rows
-from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
+from bench.benchmark.runner.run_result_rows import build_rows
+from bench.benchmark.runner.tuner_loop import drive_tuner
 from bench.core.plugin_registries import load_plugins
 from methods.tuner import Task, Tuner
 from tests.conftest import PLUGINS

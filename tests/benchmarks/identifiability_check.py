@@ -19,8 +19,8 @@ from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import find_start_with_tuner, fit_base_model
+from bench.diagnosis.fitting.trajectory_derivatives import compute_central_jacobian
 from bench.diagnosis.identifiability import assess_identifiability
-from bench.diagnosis.validation.confidence_intervals import compute_central_jacobian
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
 from sims.systems.pendulum import Pendulum

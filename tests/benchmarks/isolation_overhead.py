@@ -25,10 +25,11 @@ import numpy as np
 import psutil
 
 from bench.benchmark.isolation.tuner_processes import IsolatedRun, IsolatedTuner
-from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.runner import tuner_process_reuse
+from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.problem.tuning_problem import ProposalEvaluator
+from bench.benchmark.runner import tuner_process_start
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
-from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
+from bench.benchmark.runner.tuner_loop import drive_tuner
 from bench.benchmark.runner.tuner_training import build_tuner
 from bench.core.plugin_registries import load_plugins
 from bench.core.random_streams import make_rng, make_seed_words
@@ -81,8 +82,8 @@ def evaluation(problem, name):
     )  # fmt: skip
     entry = TunerEntry("random", "random")
     found = {"trusted": [], "sealed": [], "harness": []}
-    with tuner_process_reuse.start_isolated_tuner(
-        tuner_process_reuse.make_tuner_spec(entry), 0, "tuner"
+    with tuner_process_start.start_isolated_tuner(
+        tuner_process_start.make_tuner_spec(entry), 0, "tuner"
     ) as house:
         child = tuners_process()
         beyond = IsolatedRun(house, make_seed_words(*NAMES), 1e9)
@@ -114,7 +115,7 @@ def orders(experiment, tuner):
     target = get_problem(experiment).draw_targets()[0].blinded
     trusted = RunRequest("run", entry, 0, target, 1)
     return trusted, RunRequest(
-        "run", entry, 0, target, 1, tuned=tuner_process_reuse.make_tuner_spec(entry)
+        "run", entry, 0, target, 1, tuned=tuner_process_start.make_tuner_spec(entry)
     )
 
 
@@ -149,7 +150,7 @@ def steps(tuned):
     """Return milliseconds to start a process, to build the tuner in it, and to end it."""
     times = [perf_counter()]
     files = [tuned.file] if tuned.file else []
-    child = tuner_process_reuse.get_fork_server().start_process(
+    child = tuner_process_start.get_fork_server().start_process(
         "bench.benchmark.isolation.tuner_server:serve_requests", files
     )
     times.append(perf_counter())
@@ -178,7 +179,7 @@ def main():
         python = peer_libraries.environment(Path(place))
         for number in range(ROUNDS):
             # Start a new fork server, because the first run of a worker is measured too.
-            tuner_process_reuse.close_isolated_processes()
+            tuner_process_start.close_isolated_processes()
             rounds.append([
                 *(evaluation(problem, name) for name, problem in problems.items()),
                 run(experiment, "random"),
@@ -194,7 +195,7 @@ def main():
                     },
                     {"peer": "benchopt", "run_ms": peer_libraries.benchopt_run(python, folder)},
                 ]
-    tuner_process_reuse.close_isolated_processes()
+    tuner_process_start.close_isolated_processes()
     for rows in zip(*rounds, strict=True):
         print_medians(rows)
 

@@ -36,8 +36,8 @@ from bench.diagnosis_benchmark.case_generation.case_sampling import (
     find_equivalent_effects,
     restore_conditions,
 )
+from bench.diagnosis_benchmark.case_generation.recording_conditions import SIMULATORS
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
-    SIMULATORS,
     simulate_with_mujoco,
     simulate_with_scipy,
 )

@@ -4,16 +4,16 @@
 
 Runs of 60 samples of a pendulum and a slider without a hidden cause are linearised about the true
 model, with AR(1) noise of several coefficients, and their residuals are scored against the whole
-library. The output is the share of p-values below each level, with the present surrogates and with
-surrogates that keep the bias of the fit (`evaluation.surrogate_residuals`), for the same noise.
+library. The output is the share of p-values below each level, for the same noise, with the present
+surrogates and with those that keep the bias of the fit (`evaluation.autoregressive_surrogates`).
 """
 
 import argparse
 
 import numpy as np
 
+from bench.diagnosis.evaluation.autoregressive_surrogates import draw_surrogates
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.search.candidate_directions import compute_directions
 from bench.diagnosis.search.score_test import ScoreTest

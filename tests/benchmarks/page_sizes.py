@@ -17,9 +17,8 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.comparison_charts import AxisLabels, ComparisonView
-from bench.benchmark.comparison_page import ComparisonReportData, render_page
-from bench.benchmark.comparison_report import _render_figures
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.comparison_report import ComparisonReportData, _render_figures, render_page
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics, build_tables
 from bench.benchmark.storage.result_folder import StoredComparison
 from tests.browser import Opened, launched

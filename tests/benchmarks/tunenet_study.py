@@ -15,17 +15,22 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
-from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.tuner_loop import ProposalEvaluator, drive_tuner
+from bench.benchmark.problem.tuning_problem import ProposalEvaluator, TuningProblem
+from bench.benchmark.runner.tuner_loop import drive_tuner
 from bench.core.random_streams import make_rng
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.figure_output import write_figure
-from bench.figures.style import BLACK, BLUE, CONNECTOR_GREY, ORANGE, VERMILION, make_panel_grid
+from bench.figures.style import BLACK, BLUE, CONNECTOR_GREY, ORANGE, VERMILION
 from methods.learning.broyden_search import MIN_STEP, BroydenSearch
 from methods.learning.input_features import FeatureConfig
-from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign
-from methods.learning.pair_tuner import PairTuner, TrainedPairNetwork
+from methods.learning.pair_network import (
+    PUBLISHED_DESIGN,
+    PairNetworkDesign,
+    PairTuner,
+    TrainedPairNetwork,
+)
 from methods.learning.training_data import generate_training_data
 from methods.tuner import EMPTY_SCENE, Proposal, Task
 from methods.tuners.tunenet import TuneNet, TuneNetPublished

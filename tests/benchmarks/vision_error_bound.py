@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.benchmark.problem.experiment import TunerEntry, load_experiment
+from bench.benchmark.problem.experiment_config import TunerEntry, load_experiment
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
-from bench.bounce_shot import tuned_shots
+from bench.bounce_shot import drop_tuning
 from bench.bounce_shot.shot_config import read_shot_config
 from sims.core.files import write_atomically
 from sims.recording.recording import read_recording
@@ -58,9 +58,9 @@ def grounds(base, changes, entry):
 def tuned(experiment, folder, shot, entry, weights, effects):
     """Return the restitution that a network finds in the extended model of one shot."""
     path = folder / "recordings" / f"{shot}.csv"
-    known = tuned_shots.ShotInputs(shot, path, None, {VISION: weights})
+    known = drop_tuning.ShotInputs(shot, path, None, {VISION: weights})
     recording = read_recording(path, Ball, whole=True)
-    model = tuned_shots._tune_model(
+    model = drop_tuning._tune_model(
         experiment, read_shot_config(experiment), entry, known, recording, effects
     )
     assert model.status in ("done", "converged"), model.reason
@@ -70,18 +70,18 @@ def tuned(experiment, folder, shot, entry, weights, effects):
 def rows(folder, base):
     """Yield a row for each training, seed and shot."""
     shots = pd.read_csv(folder / "shots.csv")
-    own = shots[shots.method == tuned_shots.EXPLAIN_METHOD].set_index("shot")
+    own = shots[shots.method == drop_tuning.EXPLAIN_METHOD].set_index("shot")
     for trained in TRAINED:
         entry = TunerEntry(VISION, VISION, randomised="over drag" in trained)
         for found, ground in grounds(base, trained, entry):
-            before = tuned_shots.make_tuning_experiment(ground, read_shot_config(ground), entry)
+            before = drop_tuning.make_tuning_experiment(ground, read_shot_config(ground), entry)
             # The tuned simulator is that of the shot, independent of the training of the network.
             plain = ground.chosen(settings=base.settings)
             for seed in range(SEEDS):
                 weights = train_or_load(before, TrainingRequest(entry, seed)).path
                 for shot, fit in own.restitution.items():
                     models = json.loads((folder / "shots" / f"{shot}.json").read_text())["models"]
-                    explained = next(m for m in models if m["method"] == tuned_shots.EXPLAIN_METHOD)
+                    explained = next(m for m in models if m["method"] == drop_tuning.EXPLAIN_METHOD)
                     effects = {name: tuple(c) for name, c in explained["effects"].items()}
                     names = " ".join(sorted(effects))
                     if found in (None, names):

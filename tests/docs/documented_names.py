@@ -6,11 +6,11 @@ import simgap
 from bench.api.comparison_options import ComparisonOptions, StudyOptions
 from bench.api.datasheet import DatasheetOptions
 from bench.api.design import DesignOptions
-from bench.api.recordings import ImportRequest
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.logs.importing.import_result import ImportOptions
-from bench.logs.recording_loading import FrameDescription
+from bench.logs.importing.log_import import ImportRequest
 from bench.logs.synthetic_recording import SimulationSpec
+from sims.recording.recording_frame import FrameDescription
 
 GROUPS = {
     "Commands": (

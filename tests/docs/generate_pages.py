@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Literal, get_args, get_origin, get_type_hints, is_typeddict
 
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.storage.table_schemas import (
     ERROR_TABLE_COLUMNS,
     SHOT_TABLE_COLUMNS,
@@ -135,7 +135,7 @@ def experiment_keys():
     parts = [
         "An experiment is a TOML file. Name one of the project, or give the path of your own "
         "(`simgap compare my.toml`). The keys are the fields of "
-        "`bench.benchmark.problem.experiment.Experiment`; `experiment.toml` of a comparison "
+        "`bench.benchmark.problem.experiment_config.Experiment`; `experiment.toml` of a comparison "
         "contains all of them with their defaults. Unknown keys are errors. "
         "[Examples](../../bench/experiments), [what each tests](../problems.md).",
         keys(Experiment, ""),

@@ -54,9 +54,9 @@ def named_wrongly(words):
     The result is empty if all names exist or come from a user's file.
     """
     from bench.api.train import select_training
-    from bench.benchmark.problem.experiment import load_experiment
+    from bench.benchmark.problem.experiment_config import load_experiment
     from bench.core.plugin_registries import tuners
-    from bench.datasets import dataset_catalogue
+    from bench.datasets import public_datasets
     from sims.core.simulator import InputError
 
     options = build_parser().parse_args(words)
@@ -65,7 +65,7 @@ def named_wrongly(words):
         if words[0] == "train" and not own:
             select_training(options.tuner, options.simulator, options.experiment)
         elif words[0] == "download":
-            [dataset_catalogue.get(name) for name in options.names if name != "all"]
+            [public_datasets.get(name) for name in options.names if name != "all"]
         elif words[0] == "compare" and (name := options.experiment) and not name.endswith(".toml"):
             labels = {entry.label for entry in load_experiment(name).tuners}
             for label in [] if own or not options.tuners else options.tuners.split(","):

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from tests.docs.documentation_pages import FENCE, ROOT, blocks, quoted, section, tables, text_of
 
 SIMGAP = [sys.executable, "-m", "simgap"]

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 import tomli_w
 
-from bench.benchmark.comparison_figures import FIGURE_FILES
+from bench.benchmark.comparison_printed_figures import FIGURE_FILES
 from bench.benchmark.comparison_study import Comparison
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.statistics.error_curves import ERROR_METRICS
 from bench.benchmark.statistics.paired_tests import PAIR_COLUMNS
@@ -19,9 +19,9 @@ from bench.benchmark.statistics.training_amortisation import BREAK_EVEN_COLUMNS
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
 from bench.bounce_shot.hit_rate_table import RESULT_COLUMNS as SHOT_COLUMNS
 from bench.bounce_shot.shot_config import read_shot_config
+from bench.bounce_shot.shot_planner import TunedModel
 from bench.bounce_shot.shot_sampling import draw_shots
 from bench.bounce_shot.shot_storage import get_shot_path, read_shot, store_shot
-from bench.bounce_shot.tuned_shots import TunedModel
 from sims.core.toml_validation import read_toml
 from sims.vision.pinhole_camera import FilmDescription, PinholeCamera, format_camera_file
 from tests.command_output import run_command

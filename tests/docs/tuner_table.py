@@ -102,8 +102,7 @@ EQUATION = re.compile(r"\(([\d.]+)\)  (.*)", re.S)
 SHARED = (
     "pair_network",
     "broyden_search",
-    "observation_features",
-    "scenario_features",
+    "input_features",
     "gap_filling",
     "gaussian_process",
 )

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
 from tests.exams.explain_calls import Outcome
 from tests.exams.marking import HiddenCause, Standard, mark_answer
 from tests.exams.planted import planted_cases

@@ -28,7 +28,7 @@ def patch():
     results.
     """
     from bench.benchmark.problem.tuning_problem import TuningProblem
-    from bench.benchmark.runner import run_scoring
+    from bench.benchmark.runner import run_result_rows
 
     draw = TuningProblem.draw_target
 
@@ -41,7 +41,7 @@ def patch():
         return target
 
     TuningProblem.draw_target = noting
-    run_scoring._build_parameter_columns = lambda *_: {}
+    run_result_rows._build_parameter_columns = lambda *_: {}
 
 
 with contextlib.suppress(Exception):

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def held():
     """Return the isolation layers that work on this machine."""
-    from bench.benchmark.runner.tuner_process_reuse import get_fork_server
+    from bench.benchmark.runner.tuner_process_start import get_fork_server
 
     child = get_fork_server().start_process("bench.benchmark.isolation.tuner_server:serve_requests")
     child.wait_until_ready()

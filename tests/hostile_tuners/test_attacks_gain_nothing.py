@@ -124,7 +124,7 @@ def test_a_trusted_run_hears_of_another(trusted, name):
 
 def held():
     """Return the isolation layers that work on this machine."""
-    from bench.benchmark.runner.tuner_process_reuse import get_fork_server
+    from bench.benchmark.runner.tuner_process_start import get_fork_server
 
     child = get_fork_server().start_process("bench.benchmark.isolation.tuner_server:serve_requests")
     child.wait_until_ready()

@@ -14,10 +14,10 @@ with contextlib.suppress(OSError):
 
 def answer():
     """Patch the plugin inspection to report a simulator that does not exist."""
-    from bench.benchmark.runner import plugin_discovery
+    from bench.benchmark.runner import plugin_inspection
 
     said = {"kind": "simulator", "name": "spring", "says": ""}
-    plugin_discovery._describe_class = lambda _kind, _part: said
+    plugin_inspection._describe_class = lambda _kind, _part: said
 
 
 with contextlib.suppress(Exception):

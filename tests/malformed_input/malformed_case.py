@@ -16,7 +16,7 @@ from pathlib import Path
 
 from bench.cli.main import main
 from bench.core.plugin_registries import REGISTRIES
-from sims.core.plain_values import MAX_MESSAGE_LENGTH
+from sims.core.user_messages import MAX_MESSAGE_LENGTH
 from tests.malformed_input.shortened_work import HERE, CutError
 
 LIMIT = 30

@@ -49,9 +49,9 @@ def _no_network(url: str, *_: Any) -> Any:
 SHORT = {
     "bench.cli.commands.compare._run_study": _closed,
     "bench.benchmark.runner.dask_cluster.ClusterPool": _nobody,
-    "bench.datasets.dataset_download._download_content": _no_network,
+    "bench.datasets.public_datasets._download_content": _no_network,
     "bench.benchmark.comparison_report.build_tables": _cut,
-    "bench.studies.comparison_verification.build_tables": _cut,
+    "bench.studies.result_verification.build_tables": _cut,
     "bench.suite.multi_problem_report.ComparisonCollection.build_tables": _cut,
     "bench.benchmark.storage.provenance.distributions": _nothing,
     "bench.diagnosis.explain._diagnose_runs": _cut,

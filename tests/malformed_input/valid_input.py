@@ -13,9 +13,9 @@ import tomli_w
 
 from bench.api.recordings import simulate
 from bench.benchmark.comparison_study import Comparison
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.runner.experiment_runner import run_experiment
-from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 from bench.benchmark.runner.study_base import prepare_study
 from bench.cli.main import main
 from bench.core.plugin_registries import REGISTRIES

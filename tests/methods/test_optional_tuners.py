@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from bench.core.plugin_registries import tuners
+from methods.learning.quasi_random_points import draw_sobol_points
 from methods.tuners.neural_posterior_estimation import NeuralPosteriorEstimation
-from methods.tuners.turbo import TuRBO, _draw_sobol_points
+from methods.tuners.turbo import TuRBO
 from tests.methods.analytic_problems import START, TRUE_PARAMETERS, decays, errors
 from tests.methods.test_tunenet import Toy, check_state, run
 
@@ -41,9 +42,7 @@ def test_candidates_fill_the_trust_region_and_stay_in_the_cube():
     moved = (points != centre).sum(axis=1)
     assert moved.min() >= 1
     assert moved.mean() == pytest.approx(20.0, abs=1.0)
-    assert _draw_sobol_points(np.random.default_rng(0), 64, 3).mean() == pytest.approx(
-        0.5, abs=0.02
-    )
+    assert draw_sobol_points(np.random.default_rng(0), 64, 3).mean() == pytest.approx(0.5, abs=0.02)
 
 
 @needs_botorch

@@ -5,8 +5,8 @@ import pytest
 
 from bench.benchmark.runner.tuner_loop import drive_tuner
 from methods.learning.broyden_search import BroydenSearch
+from methods.learning.input_features import make_weighted_features, resample_runs
 from methods.learning.noise_matched_networks import estimate_noise_sigma
-from methods.learning.observation_features import make_weighted_features, resample_runs
 from methods.learning.pair_network import (
     PUBLISHED_DESIGN,
     PairInputs,

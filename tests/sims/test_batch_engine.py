@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from bench.diagnosis_benchmark.case_generation.reference_signals import TrueSystem
+from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import TrueSystem
 from sims import effects as library
 from sims.core.engine import IntegrationBatch
 from sims.core.simulator import InputError, Parameter, Scenario

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
-from sims.core.document_fields import OPTIONAL, Document, to_plain_values
+from sims.core.json_documents import OPTIONAL, Document, to_plain_values
 
 
 class Range(NamedTuple):

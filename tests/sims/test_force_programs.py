@@ -11,7 +11,7 @@ from sims.core.effect import Coefficient, Force, Friction
 from sims.core.simulator import InputError, Scenario
 from sims.engines.batch_engine import BatchEngine
 from sims.engines.compiled import force_program, register_programs
-from sims.engines.compiled.kernel import make_instruction_runner
+from sims.engines.compiled.register_programs import make_instruction_runner
 from sims.engines.compiled.traced_array import (
     OPERATION_CODES,
     PER_ELEMENT,

@@ -9,18 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.diagnosis.kalman import compiled_recursions
+from bench.diagnosis.kalman import kalman_recursions
 from sims.core.simulator import InputError
 from sims.engines.compiled import (
     data_layout,
+    element_stepping,
     interpreter,
-    kernel,
-    kernel_build,
     machine_code,
     machine_code_cache,
-    mujoco_callback,
+    numba_compilation,
+    register_programs,
     traced_array,
 )
+from sims.robot.dynamics import mujoco_callback
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -32,22 +33,22 @@ def fail_if_called():
 @pytest.mark.parametrize(
     ("module", "entry"),
     [
-        (kernel, kernel.COMPILED.make_entry()),
+        (element_stepping, element_stepping.COMPILED.make_entry()),
         (mujoco_callback, mujoco_callback.add_effect_forces),
-        (compiled_recursions, compiled_recursions.COMPILED.make_entry()),
+        (kalman_recursions, kalman_recursions.COMPILED.make_entry()),
     ],
 )
 def test_the_cache_name_depends_on_every_compiled_source_file(module, entry):
     sources = {str(path) for path in machine_code_cache.list_source_files(module.__name__)}
     assert module.__file__ in sources
     assert all(Path(path).is_file() for path in sources)
-    called = kernel_build.list_called_functions(entry)
+    called = numba_compilation.list_called_functions(entry)
     assert called
     for function in called:
         for thing in (function, *function.__globals__.values()):
             module_of_thing = inspect.getmodule(thing)
             if (
-                module is not compiled_recursions
+                module is not kalman_recursions
                 and module_of_thing is not None
                 and module_of_thing.__name__.startswith("sims.engines")
             ):
@@ -107,17 +108,21 @@ def test_one_process_compiles_while_others_wait_and_a_killed_one_blocks_none(tmp
 
 
 def load_kernel():
-    return machine_code_cache.load_stored(kernel.__name__, "COMPILED", "the batch engine", 1, {})
+    return machine_code_cache.load_stored(
+        element_stepping.__name__, "COMPILED", "the batch engine", 1, {}
+    )
 
 
 def get_kernel_path():
-    name = machine_code_cache.make_cache_name(kernel.__name__, {})
+    name = machine_code_cache.make_cache_name(element_stepping.__name__, {})
     return machine_code_cache.get_cache_folder() / name
 
 
 def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path))
-    monkeypatch.setattr(kernel_build, "_START", "raise ImportError('Numba needs an older NumPy')")
+    monkeypatch.setattr(
+        numba_compilation, "_START", "raise ImportError('Numba needs an older NumPy')"
+    )
     with pytest.raises(InputError, match="Numba needs an older NumPy; expected working versions"):
         load_kernel()
     assert "once after an install" in capsys.readouterr().err
@@ -125,19 +130,19 @@ def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, ca
 
 def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, capsys):
     path = machine_code_cache.get_cache_folder() / machine_code_cache.make_cache_name(
-        kernel.__name__, {}
+        element_stepping.__name__, {}
     )
     code = machine_code_cache.read_cached(path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path / "file"))
-    monkeypatch.setattr(kernel_build, "build_module", lambda *_: code)
+    monkeypatch.setattr(numba_compilation, "build_module", lambda *_: code)
     assert load_kernel() is not None
     assert "set SIMGAP_COMPILED to a folder that can be written" in capsys.readouterr().err
 
 
 def test_code_with_a_missing_symbol_is_not_loaded():
     path = machine_code_cache.get_cache_folder() / machine_code_cache.make_cache_name(
-        kernel.__name__, {}
+        element_stepping.__name__, {}
     )
     code = machine_code.MachineCode.unpack(machine_code_cache.read_cached(path))
     assert machine_code.MachineCode.unpack(code.pack()) == code
@@ -147,7 +152,8 @@ def test_code_with_a_missing_symbol_is_not_loaded():
 
 def test_loading_the_kernel_does_not_import_numba():
     code = (
-        "import sys; from sims.engines.compiled import kernel; assert kernel.COMPILED.load();"
+        "import sys; from sims.engines.compiled.element_stepping import COMPILED;"
+        "assert COMPILED.load();"
         "sys.exit('numba' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
@@ -211,21 +217,21 @@ def test_instructions_are_checked_and_run_on_any_number_of_slots():
     code = np.array([[ops["add"], 2, 0, 1, 0], [ops["tanh"], 3, 2, 2, 2]], dtype=np.int64)
     for size in (1, 5, 64, 130):
         r = np.zeros((4, size))
-        run = kernel.make_instruction_runner(code, 0, 2, r)
+        run = register_programs.make_instruction_runner(code, 0, 2, r)
         for seed in range(2):
             r[:2] = np.random.default_rng(seed).normal(size=(2, size))
             run()
             np.testing.assert_allclose(r[3], np.tanh(r[0] + r[1]), rtol=1e-14)
     held = np.zeros((4, 8))
-    kernel.make_instruction_runner(code, 1, 1, held)()
+    register_programs.make_instruction_runner(code, 1, 1, held)()
     assert not held.any(), "an empty program wrote to registers"
     wrong = code.copy()
     wrong[1, 1] = 4
     for bad in (
-        lambda: kernel.make_instruction_runner(wrong, 0, 2, held),
-        lambda: kernel.make_instruction_runner(code, 0, 3, held),
-        lambda: kernel.make_instruction_runner(code, 0, 2, held[:, ::2]),
-        lambda: kernel.make_instruction_runner(code.astype(np.int32), 0, 2, held),
+        lambda: register_programs.make_instruction_runner(wrong, 0, 2, held),
+        lambda: register_programs.make_instruction_runner(code, 0, 3, held),
+        lambda: register_programs.make_instruction_runner(code, 0, 2, held[:, ::2]),
+        lambda: register_programs.make_instruction_runner(code.astype(np.int32), 0, 2, held),
     ):
         with pytest.raises(
             ValueError, match=r"not for these registers|expected a contiguous array"

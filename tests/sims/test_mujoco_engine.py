@@ -11,7 +11,7 @@ import pytest
 
 from sims.core.effect import Coefficient, Force
 from sims.core.simulator import InputError, Scenario
-from sims.engines.external.mujoco_balls import compute_damping_ratio
+from sims.engines.external.mujoco_ball_contact import compute_damping_ratio
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from bench.conformance.sample_subjects import FirstOrderTank
+from bench.conformance.toy_systems import FirstOrderTank
 from sims import effects
 from sims.core.simulator import Channel, InputError, Scenario
 from sims.own_simulator import OwnSimulator

@@ -5,15 +5,8 @@ simulator.
 import numpy as np
 import pytest
 
-from sims.core.simulator import (
-    Channel,
-    Constant,
-    InputError,
-    Parameter,
-    Scenario,
-    Simulator,
-    apply_parameter_changes,
-)
+from bench.benchmark.problem.tuning_problem import apply_parameter_changes
+from sims.core.simulator import Channel, Constant, InputError, Parameter, Scenario, Simulator
 from sims.core.unit_cube import UnitCube
 
 LINEAR = Parameter("stiffness", "N/m", 3.0, (-1.0, 4.0), (0.0, 2.0))

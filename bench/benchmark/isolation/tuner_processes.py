@@ -34,7 +34,12 @@ from bench.benchmark.isolation.process_errors import (
     describe_exit,
     with_isolation,
 )
-from methods.tuner import Array, Proposal, Task, TunerGenerator
+from methods.tuner import (
+    Array,
+    Proposal,
+    Task,
+    TunerGenerator,
+)
 
 START_TIMEOUT_SECONDS = 60.0
 """Timeout in seconds for the start of a process and for building a tuner."""

@@ -20,12 +20,14 @@ do not contain the information.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
+from bench.benchmark.problem.experiment_config import Experiment
 from sims.core.simulator import Array, Parameter
 
 STIFF_SIGMA_THRESHOLD = 0.1
@@ -36,6 +38,16 @@ The standard deviation is the Cramer-Rao bound.
 
 FINITE_DIFFERENCE_STEP = 1e-4
 """Step of the central differences, in training ranges."""
+
+IDENTIFIABILITY_COLUMNS = [
+    "experiment",
+    "target",
+    "range",
+    "direction",
+    "eigenvalue",
+    "sigma",
+    "stiff",
+]
 
 
 @dataclass(frozen=True)
@@ -155,3 +167,36 @@ def compute_spectrum_from_jacobian(jacobian: Array) -> InformationSpectrum:
     largest_rows = np.abs(vectors).argmax(axis=0)[None]
     largest_entries = np.take_along_axis(vectors, largest_rows, axis=0)
     return InformationSpectrum(values, vectors * np.where(largest_entries < 0, -1.0, 1.0))
+
+
+def build_identifiability_table(
+    experiment: Experiment,
+    spectra: Mapping[str, InformationSpectrum],
+    parameters: Sequence[Parameter],
+) -> pd.DataFrame:
+    """Build a table with one row per target and direction, the stiffest direction first.
+
+    Args:
+        experiment: experiment of the targets.
+        spectra: identifiability spectrum by target.
+        parameters: tuned parameters.
+
+    Returns:
+        Table of eigenvalues, standard deviations and the components of each parameter.
+    """
+    lines = [
+        [
+            experiment.name,
+            target,
+            # The name of a target begins with its range, as in `wide-017`.
+            target.split("-")[0],
+            i + 1,
+            spectrum.values[i],
+            spectrum.sigmas[i],
+            spectrum.is_stiff[i],
+            *spectrum.vectors[:, i],
+        ]
+        for target, spectrum in spectra.items()
+        for i in range(len(spectrum.values))
+    ]
+    return pd.DataFrame(lines, columns=[*IDENTIFIABILITY_COLUMNS, *(p.name for p in parameters)])

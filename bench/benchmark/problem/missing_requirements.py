@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from bench.benchmark.problem.experiment import Experiment, expand_sweep
-from bench.benchmark.problem.recording_observations import find_recording
-from bench.benchmark.problem.robot_experiment import find_missing_model_file
+from bench.benchmark.problem.experiment_config import Experiment, expand_sweep
+from bench.benchmark.problem.experiment_recording import find_recording
+from bench.benchmark.problem.robot_experiment import find_model
 from bench.core.plugin_registries import PartUnavailableError, simulators, tuners
-from bench.datasets import dataset_catalogue as datasets
-from bench.datasets.dataset_catalogue import DataSet
+from bench.datasets import public_datasets as datasets
+from bench.datasets.public_datasets import DataSet
 from sims.core.simulator import InputError
 from sims.engines.engine_lookup import ENGINE_MODULES, missing_packages
+
+if TYPE_CHECKING:
+    from bench.datasets.public_datasets import DataSet
 
 
 @dataclass(frozen=True)
@@ -195,3 +199,30 @@ def _explain_missing_tuners(experiment: Experiment) -> Mapping[str, str]:
         except PartUnavailableError as error:
             reasons[entry.label] = error.reason
     return reasons
+
+
+def list_dependent_experiments(data_set: DataSet) -> list[str]:
+    """Return the names of the project's experiments that need a data set."""
+    from bench.benchmark.problem.experiment_config import list_experiment_names, load_experiment
+    from bench.datasets.public_datasets import find_providing_data_set
+
+    names = []
+    for name in list_experiment_names():
+        experiment = load_experiment(name)
+        paths = [("robot", experiment.model)]
+        if experiment.recording:
+            paths.append(("recording", experiment.recording.path))
+        if data_set in [find_providing_data_set(*path) for path in paths]:
+            names.append(name)
+    return names
+
+
+def find_missing_model_file(experiment: Experiment) -> str:
+    """Return why an experiment's model file is missing; empty if it exists or is not needed."""
+    if not experiment.model:
+        return ""
+    try:
+        find_model(experiment.model, experiment.name)
+    except PartUnavailableError as error:
+        return error.reason
+    return ""

@@ -8,20 +8,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.benchmark.problem.experiment import (
+from bench.benchmark.problem.experiment_config import (
     Experiment,
     HeldOutConfig,
     RecordingSource,
+    TunerEntry,
     check_name,
 )
-from bench.benchmark.problem.experiment_tables import TunerEntry
-from bench.benchmark.problem.recording_observations import find_recording
+from bench.benchmark.problem.experiment_recording import find_recording
 from bench.core.plugin_registries import make_robot_simulator, simulators
-from bench.datasets import dataset_catalogue as datasets
+from bench.datasets import public_datasets as datasets
 from sims.core.files import is_existing_file, require_file
-from sims.core.plain_values import truncate_text
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import InputError, Simulator
+from sims.core.user_messages import truncate_text
 from sims.recording.recording import read_recording
 from sims.recording.recording_description import read_model_reference
 from sims.system_simulator import SystemSimulator
@@ -78,17 +78,6 @@ def complete_robot_experiment(experiment: Experiment) -> Experiment:
         changes["inputs"] = dict(default_recording.inputs)
     unspecified = {key: value for key, value in changes.items() if not getattr(experiment, key)}
     return experiment.chosen(**unspecified)
-
-
-def find_missing_model_file(experiment: Experiment) -> str:
-    """Return why an experiment's model file is missing; empty if it exists or is not needed."""
-    if not experiment.model:
-        return ""
-    try:
-        find_model(experiment.model, experiment.name)
-    except PartUnavailableError as error:
-        return error.reason
-    return ""
 
 
 def find_model(path: str, name: str) -> Path:

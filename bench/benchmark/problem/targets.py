@@ -17,8 +17,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from bench.benchmark.problem.experiment import Experiment, FixedOrRange
-from bench.benchmark.problem.recording_observations import ObservedRuns, RecordedRuns
+from bench.benchmark.problem.experiment_config import Experiment, FixedOrRange
+from bench.benchmark.problem.experiment_recording import ObservedRuns, RecordedRuns
 from bench.core.input_signals import evaluate_signal
 from bench.core.random_streams import TargetStreams
 from sims.core.simulator import Array, Channel, InputError, Scenario, Simulator

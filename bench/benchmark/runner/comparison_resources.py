@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from bench.benchmark.problem.experiment import Experiment, TunerEntry, expand_sweep
-from bench.benchmark.problem.recording_observations import find_recording
+from bench.benchmark.problem.experiment_config import Experiment, TunerEntry, expand_sweep
+from bench.benchmark.problem.experiment_recording import find_recording
 from bench.benchmark.problem.robot_experiment import get_simulator_class
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.experiment_runner import check_tuners, count_seeds

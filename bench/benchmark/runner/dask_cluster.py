@@ -21,8 +21,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from bench.benchmark.runner.code_digest import hash_package_versions, hash_source_folders
-from bench.benchmark.runner.plugin_discovery import Plugin
+from bench.benchmark.runner.plugin_inspection import Plugin
+from bench.benchmark.runner.run_fingerprint import hash_package_versions, hash_source_folders
 from bench.benchmark.runner.trained_weights import TrainingResult, get_weights_folder
 from bench.benchmark.runner.tuner_training import train_or_load
 from bench.benchmark.runner.worker_pools import Call, LocalPool, PoolLostError

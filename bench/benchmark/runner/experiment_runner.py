@@ -16,21 +16,26 @@ from bench.benchmark.isolation.linux_syscalls import not_dumpable
 from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.isolation.resource_limits import import_resource_module
 from bench.benchmark.isolation.tuner_processes import TunerSpec
-from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench.benchmark.problem.experiment_config import Experiment, TunerEntry
 from bench.benchmark.problem.fisher_information import InformationSpectrum
 from bench.benchmark.problem.targets import Redraws, Target, count_redraws
 from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
-from bench.benchmark.runner.plugin_discovery import (
+from bench.benchmark.runner.plugin_inspection import (
     check_classes_importable,
     describe_plugins,
     must_build_isolated,
 )
 from bench.benchmark.runner.run_fingerprint import RunIds
-from bench.benchmark.runner.run_in_worker import RunOutcome, RunRequest, execute_run
-from bench.benchmark.runner.run_scoring import build_rows, make_status, make_unfinished_outcome
+from bench.benchmark.runner.run_in_worker import (
+    RunOutcome,
+    RunRequest,
+    execute_run,
+    make_unfinished_outcome,
+)
+from bench.benchmark.runner.run_result_rows import build_rows, make_status
 from bench.benchmark.runner.trained_weights import TrainingResult, WeightsError
 from bench.benchmark.runner.tuner_author_notes import Notes
-from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
+from bench.benchmark.runner.tuner_process_start import make_tuner_spec
 from bench.benchmark.runner.tuner_training import TrainingRequest, build_tuner, train_or_load
 from bench.benchmark.runner.worker_pools import (
     Call,

@@ -3,37 +3,370 @@
 ``cma_es/wide-017/0/3f9ac2d15b`` consists of tuner, target, seed and a hash. The hash covers the
 tuner's options, the simulator with its settings, the target's scenario and observation, budget,
 limits, code and package versions.
+
+Hash everything that determines a run: code, classes, recordings and package versions.
+
+The id of a run and the name of a file of trained weights contain these hashes. If something that
+determines a run were missing here, one run or one set of weights could be mistaken for another.
+Therefore whole source folders are hashed, and a class whose source cannot be found is refused.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import inspect
+import json
+import linecache
+import platform
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from pathlib import Path
+from typing import Any
 
-from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench import __version__
+from bench.benchmark.problem.experiment_config import Experiment, TunerEntry, list_effect_names
+from bench.benchmark.problem.experiment_recording import find_recording
 from bench.benchmark.problem.robot_experiment import get_simulator_class
 from bench.benchmark.problem.targets import BlindedTarget
-from bench.benchmark.runner.code_digest import (
-    BOUNCE_SHOT_SOURCE_FOLDERS,
-    DIAGNOSIS_SOURCE_FOLDERS,
-    EXPLAIN_SOURCE_FOLDERS,
-    IRRELEVANT_KEYS,
-    compute_digest,
-    hash_class_source,
-    hash_effect_sources,
-    hash_package_versions,
-    hash_plugin_files,
-    hash_recording,
-    hash_source_folders,
-    select_relevant_keys,
-)
-from bench.benchmark.runner.plugin_discovery import (
-    list_compared_parts,
-    load_plugins_for_experiment,
-)
-from bench.benchmark.storage.result_folder import FolderConfiguration
-from bench.core.plugin_registries import PartUnavailableError, tuners
+from bench.core.plugin_registries import PartUnavailableError, diagnosers, tuners
+from sims import effects
+from sims.core.registry import Registry
 from sims.core.simulator import InputError
+
+PROJECT_ROOT = Path(__file__).resolve().parents[3]
+"""Root folder of this project's packages."""
+COMPARISON_SOURCE_FOLDERS = (
+    "methods",
+    "sims",
+    "bench/core",
+    "bench/benchmark/problem",
+    "bench/benchmark/runner",
+    "bench/benchmark/isolation",
+)
+"""Source folders that determine runs: tuners, simulators, and the code that drives and scores."""
+BOUNCE_SHOT_SOURCE_FOLDERS = (
+    *COMPARISON_SOURCE_FOLDERS,
+    "bench/bounce_shot",
+    "bench/diagnosis",
+    "bench/logs",
+)
+"""Source folders that determine bounce shots: also drops, films and explanations."""
+EXPLAIN_SOURCE_FOLDERS = (
+    *COMPARISON_SOURCE_FOLDERS,
+    "bench/misspecification",
+    "bench/diagnosis",
+    "bench/logs",
+)
+"""Source folders that determine extended simulators and the runs in them."""
+DIAGNOSIS_SOURCE_FOLDERS = (
+    "sims",
+    "bench/benchmark/problem",
+    "bench/benchmark/runner",
+    "bench/benchmark/isolation",
+    "bench/diagnosis",
+    "bench/logs",
+    "bench/diagnosis_benchmark/case_generation",
+    "bench/diagnosis_benchmark/diagnosers",
+)
+"""Source folders that determine the answers of diagnosers."""
+NUMERICAL_PACKAGES = (
+    "av",
+    "botorch",
+    "cma",
+    "llvmlite",
+    "mujoco",
+    "nlopt",
+    "numba",
+    "numpy",
+    "opencv-python-headless",
+    "pybullet",
+    "sbi",
+    "scikit-learn",
+    "scikit-optimize",
+    "scipy",
+    "torch",
+)
+"""Numerical packages; another version of one may give other results."""
+_PLUGIN_MODULE_PREFIX = "simgap_plugin_"
+"""Prefix of the module names of plugin files (`bench.core.plugin_registries`)."""
+_ENTRY_POINT_GROUPS = ("simgap.tuners", "simgap.simulators", "simgap.effects", "simgap.diagnosers")
+"""Entry-point groups by which installed plugins register."""
+
+
+def compute_digest(*parts: Any, length: int = 10) -> str:
+    """Return a short hexadecimal hash of plain values; arrays are given as bytes.
+
+    Args:
+        parts: values to hash.
+        length: number of hexadecimal digits.
+    """
+    text = json.dumps(parts, sort_keys=True, default=_convert_for_json)
+    return hashlib.sha256(text.encode()).hexdigest()[:length]
+
+
+def _convert_for_json(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return hashlib.sha256(value).hexdigest()
+    return dict(value) if isinstance(value, Mapping) else str(value)
+
+
+@cache
+def hash_source_folders(which: tuple[str, ...] = ()) -> str:
+    """Hash the version and every file of some source folders.
+
+    The hash changes with any line of code, so that results of different code are never mixed.
+
+    Args:
+        which: Folders relative to the project; `COMPARISON_SOURCE_FOLDERS` if empty.
+    """
+    return compute_digest(
+        __version__,
+        [
+            _read_source_files(PROJECT_ROOT / source_folder, PROJECT_ROOT)
+            for source_folder in which or COMPARISON_SOURCE_FOLDERS
+        ],
+    )
+
+
+def _read_source_files(folder: Path, root: Path) -> list[tuple[str, bytes]]:
+    """Return relative path and content of each file in a folder, without compiled Python files."""
+    files = [
+        file
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and "__pycache__" not in file.parts
+    ]
+    return [(file.relative_to(root).as_posix(), file.read_bytes()) for file in files]
+
+
+@cache
+def hash_package_versions() -> str:
+    """Hash the versions of Python and of the numerical packages."""
+    packages = [_format_package_version(name) for name in NUMERICAL_PACKAGES]
+    return compute_digest(platform.python_version(), packages)
+
+
+def _format_package_version(name: str) -> str:
+    """Return name and version of an installed package, or a note that it is absent."""
+    try:
+        return f"{name} {version(name)}"
+    except PackageNotFoundError:
+        return f"{name} absent"
+
+
+def hash_plugin_files(plugins: Sequence[str]) -> str:
+    """Hash the names and contents of plugin files."""
+    return compute_digest([[Path(p).name, Path(p).read_bytes()] for p in plugins])
+
+
+def hash_recording(experiment: Experiment) -> str:
+    """Hash the two files of the recording; empty if the experiment has none."""
+    if experiment.recording is None:
+        return ""
+    table = find_recording(experiment.recording.path)
+    return hashlib.sha256(table.read_bytes() + table.with_suffix(".toml").read_bytes()).hexdigest()
+
+
+IRRELEVANT_KEYS = {
+    "title": "descriptive text",
+    "says": "descriptive text",
+    "tags": "descriptive text",
+    "identifiable": "descriptive text",
+    "suite": "descriptive text",
+    "problem_hashes": "an experiment that is run names no other experiments",
+    "negligible_error": "used in the ranking, after all runs",
+    "identifiability": "computed separately from the runs",
+    "recording": "path of the file; its content is hashed",
+    "model": "path of the file; its content is hashed",
+    "calibration": "its result is in the settings of the tuned simulator",
+    "shot": "uses the tuned model, after the runs",
+    "diagnosis": "comparison of diagnosers, which tunes nothing",
+    "sweep": "an experiment that is run has single values",
+    "experiments": "an experiment that is run names no other experiments",
+    "nuisance": "affects randomised entries only, and is hashed with them",
+}
+"""Keys of an experiment that change neither runs nor trained weights, each with the reason."""
+
+
+def select_relevant_keys(experiment: Experiment, irrelevant: Iterable[str]) -> dict[str, Any]:
+    """Return the fields of an experiment's configuration that affect a result, to be hashed.
+
+    Irrelevant fields are listed instead of the relevant ones, so that a new field of `Experiment`
+    counts as relevant until it is listed with a reason.
+
+    Args:
+        experiment: configuration of the experiment.
+        irrelevant: names of the fields that are left out.
+    """
+    document = experiment.document() | {"name": experiment.name}
+    return {name: value for name, value in document.items() if name not in irrelevant}
+
+
+def hash_class_source(kind: type) -> str:
+    """Hash the source of a class and of its base classes.
+
+    A class of this project's source folders is represented by its name, because
+    `hash_source_folders` hashes their content. A class of a plugin file is represented by the file,
+    one of an installed plugin by its whole package, and one of a notebook cell or a script by its
+    own text. A class that is made at run time has the attribute ``source_digest``, a text that
+    changes with everything that determines the class. Its attribute ``made_of`` may list further
+    classes that it uses.
+
+    Args:
+        kind: Simulator, tuner, effect or diagnoser class.
+
+    Raises:
+        InputError: the source of a class cannot be found.
+    """
+    return compute_digest(
+        [(_get_class_name(part), _represent_class(part)) for part in _list_source_classes(kind)]
+    )
+
+
+def _get_class_name(kind: type) -> str:
+    """Return the full name of a class; the changing module name of a plugin file is replaced."""
+    plugin = kind.__module__.startswith(_PLUGIN_MODULE_PREFIX)
+    return f"{'plugin' if plugin else kind.__module__}.{kind.__qualname__}"
+
+
+def _list_source_classes(kind: type) -> list[type]:
+    """Return a class, its bases, and the classes that it lists in ``made_of``, recursively.
+
+    Their sources together determine the behaviour of the class, so all of them are hashed.
+
+    Args:
+        kind: Class whose behaviour is hashed.
+    """
+    classes: list[type] = []
+    waiting = [kind]
+    while waiting:
+        # `__mro__` has the class itself and all its bases.
+        for part in waiting.pop().__mro__:
+            # Classes of the standard library, such as `ABC`, are determined by the version of
+            # Python. A class that a metaclass made may name a module there, but is not defined in
+            # it.
+            if part in classes or (_is_standard_library(part) and _is_defined_in_module(part)):
+                continue
+            classes.append(part)
+            waiting += vars(part).get("made_of", ())
+    return classes
+
+
+def _is_standard_library(kind: type) -> bool:
+    top = _get_top_level_package(kind)
+    return top in sys.stdlib_module_names and top != "__main__"
+
+
+def _get_top_level_package(kind: type) -> str:
+    return kind.__module__.partition(".")[0]
+
+
+def _is_defined_in_module(kind: type) -> bool:
+    """Return whether the module that a class names contains this class under its name.
+
+    Only then is the module's source the source of the class. Counterexamples are classes that a
+    function makes from one source with different values, and a class that ``type(...)`` makes from
+    an abstract class, which names `abc` as its module.
+    """
+    attribute: Any = sys.modules.get(kind.__module__)
+    for name in kind.__qualname__.split("."):
+        attribute = getattr(attribute, name, None)
+    return attribute is kind
+
+
+def _represent_class(kind: type) -> Any:
+    """Return what represents a class in a hash.
+
+    * A class that is made at run time: its attribute ``source_digest``.
+    * A class of a notebook or of the main script: its source.
+    * A class of this project's source folders: "", because `hash_source_folders` covers it.
+    * Any other class: the content of the plugin file or package that defines it.
+
+    Raises:
+        InputError: the source of the class cannot be found.
+    """
+    # The digest is not inherited, because a subclass behaves differently.
+    if (source_digest := vars(kind).get("source_digest")) is not None:
+        return source_digest
+    if not _is_defined_in_module(kind):
+        raise _make_source_error(kind)
+    if kind.__module__ == "__main__":
+        return _read_class_source(kind)
+    file = getattr(sys.modules[kind.__module__], "__file__", None)
+    if file is None:
+        raise _make_source_error(kind)
+    path = Path(file).resolve()
+    if any(
+        path.is_relative_to(PROJECT_ROOT / source_folder)
+        for source_folder in COMPARISON_SOURCE_FOLDERS
+    ):
+        return ""
+    return _read_package_contents(kind, path)
+
+
+def _read_class_source(kind: type) -> str:
+    """Return the source of a class of a notebook cell or of the main script.
+
+    Args:
+        kind: Class whose source determines results and is therefore hashed.
+
+    Returns:
+        Text of the class, or of the whole notebook cell that defines it.
+
+    Raises:
+        InputError: the source cannot be found.
+    """
+    try:
+        return inspect.getsource(kind)
+    except (OSError, TypeError):
+        pass
+    # A notebook has no file to search for classes, but functions refer to the text of their cell.
+    for function in filter(inspect.isfunction, vars(kind).values()):
+        if cell := linecache.getlines(function.__code__.co_filename):
+            return "".join(cell)
+    raise _make_source_error(kind)
+
+
+def _read_package_contents(kind: type, path: Path) -> Any:
+    """Return the contents of an installed plugin's package, or else of the file with the class.
+
+    Args:
+        kind: class to be hashed.
+        path: file that defines the class.
+
+    Returns:
+        For a package, a list of (relative path, content) for each of its folders; for a file, its
+        name and content.
+    """
+    package = _get_top_level_package(kind)
+    # A module without a package has no `__path__`.
+    folders = getattr(sys.modules.get(package), "__path__", None)
+    if folders and package in _list_plugin_packages():
+        return [_read_source_files(Path(folder), Path(folder)) for folder in folders]
+    return path.name, path.read_bytes()
+
+
+def _make_source_error(kind: type) -> InputError:
+    """Make the error for a class whose source code cannot be found, so that it cannot be hashed."""
+    return InputError(
+        f"class {kind.__qualname__} of {kind.__module__}: expected a class of a module, a plugin "
+        "file or a notebook's cell, found one whose source cannot be determined; define it there "
+        "under its own name, or give it a text source_digest that changes with its content"
+    )
+
+
+@cache
+def _list_plugin_packages() -> frozenset[str]:
+    """Return the top-level packages of installed plugins, including this project's own."""
+    entries = [entry for group in _ENTRY_POINT_GROUPS for entry in entry_points(group=group)]
+    return frozenset(entry.module.partition(".")[0] for entry in entries)
+
+
+def hash_effect_sources(*settings: Mapping[str, Any]) -> list[str]:
+    """Hash the sources of effects named in simulator settings; the simulator class lacks them."""
+    return [hash_class_source(effects.get_effect(name)) for name in list_effect_names(*settings)]
+
 
 RUN_IRRELEVANT_KEYS = {
     **IRRELEVANT_KEYS,
@@ -115,59 +448,6 @@ def _hash_class_sources(experiment: Experiment) -> list[str]:
     return sources
 
 
-def check_unchanged(folder: Path, initial: dict[str, str], present: dict[str, str]) -> None:
-    """Raise an error if the configuration of a study has changed.
-
-    Args:
-        folder: folder of the study.
-        initial: hashes by readable name when the study was started; empty if they are unknown.
-        present: present hashes, from `compute_fingerprint`.
-
-    Raises:
-        InputError: something has changed since the study was started.
-    """
-    if not initial:
-        raise InputError(
-            f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
-        )
-    # The first difference is reported: direct changes are listed before their consequences.
-    for hash_name, hashed in present.items():
-        if initial.get(hash_name) != hashed:
-            raise InputError(
-                f"{folder}: its {hash_name} changed since it was started ({initial.get(hash_name)} "
-                f"then, {hashed} now); all runs need the same configuration: restore it, or start "
-                "a new comparison"
-            )
-
-
-def check_resumable(
-    folder: Path, configuration: FolderConfiguration, plugins: Sequence[str]
-) -> list[str]:
-    """Check that a study can be resumed, and load its plugins.
-
-    Args:
-        folder: folder of the study.
-        configuration: configuration with which the study was started.
-        plugins: additional plugin files.
-
-    Returns:
-        All plugin files that the study needs.
-
-    Raises:
-        InputError: something relevant has changed since the study was started.
-    """
-    # The study's own plugins come first and in their order, as when it was started.
-    added_paths = {str(Path(p).resolve()) for p in plugins}
-    all_plugins = configuration.plugins + sorted(added_paths - set(configuration.plugins))
-    load_plugins_for_experiment(all_plugins, configuration.experiment)
-    check_unchanged(
-        folder,
-        configuration.fingerprint,
-        compute_fingerprint(configuration.experiment, all_plugins),
-    )
-    return all_plugins
-
-
 class RunIds:
     """Identifiers of an experiment's runs."""
 
@@ -244,3 +524,9 @@ def _hash_target(target: BlindedTarget) -> str:
     return compute_digest(
         scenarios, [run_set.observed.tobytes() for run_set in run_sets], target.start.tobytes()
     )
+
+
+def list_compared_parts(experiment: Experiment) -> list[tuple[Registry[Any], str]]:
+    """List the tuners or diagnosers that an experiment compares: registry and registered name."""
+    names = [(tuners, entry.tuner) for entry in experiment.tuners]
+    return [*names, *((diagnosers, name) for name in experiment.diagnosis.get("diagnosers", ()))]

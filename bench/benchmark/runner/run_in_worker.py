@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
+import numpy as np
+
 from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.isolation.resource_limits import limited_memory
 from bench.benchmark.isolation.tuner_processes import (
@@ -24,18 +26,13 @@ from bench.benchmark.isolation.tuner_processes import (
     Written,
     relocate,
 )
-from bench.benchmark.problem.experiment import Experiment, TunerEntry
-from bench.benchmark.problem.targets import BlindedTarget
-from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.problem.experiment_config import Experiment, TunerEntry
+from bench.benchmark.problem.targets import BlindedTarget, Target
+from bench.benchmark.problem.tuning_problem import ProposalEvaluator, TuningProblem
 from bench.benchmark.runner.retry_after_kill import RepeatedRequests, retry_if_killed
 from bench.benchmark.runner.trained_weights import read_weights
-from bench.benchmark.runner.tuner_loop import (
-    Evaluate,
-    ProposalEvaluator,
-    RunTrace,
-    drive_tuner,
-)
-from bench.benchmark.runner.tuner_process_reuse import start_isolated_tuner
+from bench.benchmark.runner.tuner_loop import Evaluate, RunTrace, drive_tuner
+from bench.benchmark.runner.tuner_process_start import start_isolated_tuner
 from bench.benchmark.runner.tuner_training import build_tuner, load_trained_tuner
 from bench.benchmark.storage.run_status import FAILED_STATUSES
 from bench.core.random_streams import make_rng, make_seed_words
@@ -268,3 +265,22 @@ def _run_isolated(
             ended.status, ended.reason or "its process did not start in time", task.start
         )
         return trace, NOTHING_WRITTEN, 0.0
+
+
+def make_unfinished_outcome(
+    problem: TuningProblem, target: Target, status: str, reason: str
+) -> RunOutcome:
+    """Make the outcome of a run that ended without a trace, as if its process was killed.
+
+    It has no simulations, and its only recommendation is the start of the target.
+
+    Args:
+        problem: tuning problem.
+        target: target of the run.
+        status: how the run ended, such as ``crashed`` or ``timeout``.
+        reason: reason of the status.
+    """
+    trace = RunTrace.make_unfinished(status, reason, target.blinded.start)
+    # The errors have one row, for the start, which was not simulated.
+    unknown_errors = np.full((1, len(problem.channels)), np.nan)
+    return RunOutcome(trace, obs_rmse=unknown_errors, heldout_rmse=None, seconds=0.0)

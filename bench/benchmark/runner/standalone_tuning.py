@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.benchmark.runner.tuner_loop import Evaluate, drive_tuner
 from bench.core.plugin_registries import tuners
-from methods.learning.training_data import generate_quasi_random_points
+from methods.learning.quasi_random_points import generate_quasi_random_points
 from methods.tuner import Task
 from sims.core.simulator import Array, InputError, Parameter
 from sims.core.unit_cube import UnitCube

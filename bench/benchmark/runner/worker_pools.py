@@ -36,7 +36,7 @@ from sims.core.simulator import InputError
 from sims.engines.engine_lookup import describe_stepping
 
 if TYPE_CHECKING:
-    from bench.benchmark.runner.plugin_discovery import Plugin
+    from bench.benchmark.runner.plugin_inspection import Plugin
 
 _EXIT_WAIT_SECONDS = 5.0
 """Time in seconds that a worker has to end before it is left behind."""
@@ -144,7 +144,7 @@ def initialise_worker(plugins: Sequence[Plugin], start_sender: Any) -> None:
     start_sender.send(os.getpid())
     threading.Thread(target=_end_with_parent, daemon=True, name="end-with-parent").start()
     set_not_dumpable()
-    from bench.benchmark.runner.plugin_discovery import register_plugins
+    from bench.benchmark.runner.plugin_inspection import register_plugins
 
     register_plugins(plugins)
     _discard_output()

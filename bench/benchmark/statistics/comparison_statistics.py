@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.fisher_information import InformationSpectrum
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.statistics.error_curves import (
     RunCurves,
     RunRowTable,
@@ -37,13 +36,32 @@ from bench.benchmark.statistics.tuner_ranking import (
     rank_tuners,
 )
 from bench.benchmark.storage.result_folder import StoredComparison
-from sims.core.simulator import Parameter
 
 PRICED_LEVEL_COUNT = 3
 """Number of thresholds for which costs are computed, the loosest first.
 
 Few tuners reach the tighter ones.
 """
+
+REQUIRED_RUN_COLUMNS = (
+    "run",
+    "experiment",
+    "tuner",
+    "target",
+    "seed",
+    "range",
+    "k",
+    "param_error",
+    "param_abs_error",
+    "stiff_error",
+    "sloppy_error",
+    "obs_error",
+    "heldout_error",
+    "outside",
+    "tuner_seconds",
+    "simulator_seconds",
+)
+"""Columns of the runs that tables and figures use."""
 
 
 class ComparisonStatistics:
@@ -384,47 +402,3 @@ def _build_fastest_tuner_table(experiment: str, statistics: ComparisonStatistics
         for line in find_cheapest_tuners(by_tuner, TARGETS_PER_TRAINING)
     ]
     return pd.DataFrame(lines, columns=WINNER_COLUMNS)
-
-
-IDENTIFIABILITY_COLUMNS = [
-    "experiment",
-    "target",
-    "range",
-    "direction",
-    "eigenvalue",
-    "sigma",
-    "stiff",
-]
-
-
-def build_identifiability_table(
-    experiment: Experiment,
-    spectra: Mapping[str, InformationSpectrum],
-    parameters: Sequence[Parameter],
-) -> pd.DataFrame:
-    """Build a table with one row per target and direction, the stiffest direction first.
-
-    Args:
-        experiment: experiment of the targets.
-        spectra: identifiability spectrum by target.
-        parameters: tuned parameters.
-
-    Returns:
-        Table of eigenvalues, standard deviations and the components of each parameter.
-    """
-    lines = [
-        [
-            experiment.name,
-            target,
-            # The name of a target begins with its range, as in `wide-017`.
-            target.split("-")[0],
-            i + 1,
-            spectrum.values[i],
-            spectrum.sigmas[i],
-            spectrum.is_stiff[i],
-            *spectrum.vectors[:, i],
-        ]
-        for target, spectrum in spectra.items()
-        for i in range(len(spectrum.values))
-    ]
-    return pd.DataFrame(lines, columns=[*IDENTIFIABILITY_COLUMNS, *(p.name for p in parameters)])

@@ -31,6 +31,12 @@ from bench.benchmark.storage.run_status import FAILED_STATUSES
 from bench.benchmark.storage.table_schemas import ERROR_FLOOR, ERROR_METRICS
 from sims.core.simulator import Array
 
+MIN_ERROR = 1e-12
+"""Errors below this value count as equal, because they consist of rounding."""
+
+_FAILED_RUN_LOG_ERROR = 1e3
+"""Logarithm that represents a failed run: larger than any error, and equal for all failures."""
+
 
 @dataclass(frozen=True)
 class RunCurves:
@@ -525,3 +531,41 @@ def _compute_median_with_interval(
         values[:, None], compute_resampled_medians, *names, resamples=_BOOTSTRAP_RESAMPLES
     )
     return float(np.median(values)), float(low[0]), float(high[0])
+
+
+def build_log_error_table(curves: RunCurves, k: int = -1, floor: float = MIN_ERROR) -> pd.DataFrame:
+    """Compute the logarithms of errors after k simulations, by target and tuner.
+
+    The mean over seeds is taken first. A failure in one seed makes it infinite, so the tuner counts
+    as failed on this target.
+
+    Args:
+        curves: error of every run.
+        k: number of simulations; -1 for all.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        Table with one row per target and one column per tuner.
+    """
+    columns = {}
+    for tuner in curves.list_tuners():
+        tuner_curves = curves.select(tuner=tuner)
+        names, groups = tuner_curves.group_by_target()
+        errors = average_over_seeds(tuner_curves.after(k), groups)
+        columns[tuner] = pd.Series(compute_log_errors(errors, floor), index=names)
+    return pd.DataFrame(columns)
+
+
+def compute_log_errors(errors: Array, floor: float = MIN_ERROR) -> Array:
+    """Return logarithms of errors (n,); errors below `floor` count as equal to it.
+
+    An infinite error, as of a failed run, becomes a number that is larger than any error.
+
+    Args:
+        errors: (n,) errors.
+        floor: smallest error that is distinguished.
+    """
+    logs: Array = np.where(
+        np.isinf(errors), _FAILED_RUN_LOG_ERROR, np.log(np.maximum(errors, floor))
+    )
+    return logs

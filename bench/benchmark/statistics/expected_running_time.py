@@ -262,3 +262,29 @@ def build_runtime_table(curves: RunCurves, thresholds: Array) -> pd.DataFrame:
             columns = (str(kind), tuner, points, share)
             parts.append(pd.DataFrame(dict(zip(RUNTIME_SHARE_COLUMNS, columns, strict=True))))
     return pd.concat(parts, ignore_index=True)
+
+
+def compute_runtime_shares(curves: RunCurves, thresholds: Array) -> list[dict[str, Array]]:
+    """Compute the share of thresholds that each tuner has reached after 0..100 % of the budget.
+
+    Problems have different budgets, so shares of it make them comparable.
+
+    Args:
+        curves: errors of all runs of one comparison.
+        thresholds: thresholds of the runtime distribution.
+
+    Returns:
+        For each range: the shares (101,) by tuner.
+    """
+    budget = curves.values.shape[1] - 1
+    points = np.floor(np.linspace(0, budget, 101)).astype(np.int64)
+    shares = []
+    for kind in dict.fromkeys(curves.keys["range"]):
+        range_curves = curves.select(range=str(kind))
+        shares.append(
+            {
+                t: compute_solved_fraction(range_curves.select(tuner=t), thresholds, points)
+                for t in range_curves.list_tuners()
+            }
+        )
+    return shares

@@ -14,7 +14,11 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.statistics.error_curves import RunCurves, average_over_seeds
+from bench.benchmark.statistics.error_curves import (
+    MIN_ERROR,
+    RunCurves,
+    build_log_error_table,
+)
 from sims.core.simulator import Array
 
 PAIR_COLUMNS = [
@@ -29,33 +33,6 @@ PAIR_COLUMNS = [
     "p_value",
     "p_holm",
 ]
-MIN_ERROR = 1e-12
-"""Errors below this value count as equal, because they consist of rounding."""
-_FAILED_RUN_LOG_ERROR = 1e3
-"""Logarithm that represents a failed run: larger than any error, and equal for all failures."""
-
-
-def build_log_error_table(curves: RunCurves, k: int = -1, floor: float = MIN_ERROR) -> pd.DataFrame:
-    """Compute the logarithms of errors after k simulations, by target and tuner.
-
-    The mean over seeds is taken first. A failure in one seed makes it infinite, so the tuner counts
-    as failed on this target.
-
-    Args:
-        curves: error of every run.
-        k: number of simulations; -1 for all.
-        floor: errors below this value count as equal to it.
-
-    Returns:
-        Table with one row per target and one column per tuner.
-    """
-    columns = {}
-    for tuner in curves.list_tuners():
-        tuner_curves = curves.select(tuner=tuner)
-        names, groups = tuner_curves.group_by_target()
-        errors = average_over_seeds(tuner_curves.after(k), groups)
-        columns[tuner] = pd.Series(compute_log_errors(errors, floor), index=names)
-    return pd.DataFrame(columns)
 
 
 def compare_all_pairs(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFrame:
@@ -99,21 +76,6 @@ def correct_holm(p: Array) -> Array:
     multiplied = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))
     corrected[order] = np.minimum(multiplied, 1.0)
     return corrected
-
-
-def compute_log_errors(errors: Array, floor: float = MIN_ERROR) -> Array:
-    """Return logarithms of errors (n,); errors below `floor` count as equal to it.
-
-    An infinite error, as of a failed run, becomes a number that is larger than any error.
-
-    Args:
-        errors: (n,) errors.
-        floor: smallest error that is distinguished.
-    """
-    logs: Array = np.where(
-        np.isinf(errors), _FAILED_RUN_LOG_ERROR, np.log(np.maximum(errors, floor))
-    )
-    return logs
 
 
 class PairedTest(NamedTuple):
@@ -165,3 +127,20 @@ def compare_pair(a: Array, b: Array) -> PairedTest:
     # The ratio of a failed run and a successful one would overflow.
     ratio = float(np.exp(np.clip(np.median(difference), -700, 700)))
     return PairedTest(len(difference), win_share, effect, ratio, p)
+
+
+def compute_mcnemar_p_value(first_only: int, second_only: int) -> float:
+    """Compute the p-value of McNemar's exact test, two-sided: are two diagnosers equally good?
+
+    If they are, each case that only one of them answered correctly is as likely to be the first
+    one's as the second one's. Without such cases the p-value is 1.
+
+    Args:
+        first_only: number of cases that only the first diagnoser answered correctly.
+        second_only: number of cases that only the second diagnoser answered correctly.
+    """
+    from scipy.stats import binomtest
+
+    if first_only + second_only:
+        return float(binomtest(first_only, first_only + second_only).pvalue)
+    return 1.0

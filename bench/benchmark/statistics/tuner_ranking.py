@@ -39,13 +39,8 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.statistics.bootstrap import INTERVAL_QUANTILES
-from bench.benchmark.statistics.error_curves import RunCurves
-from bench.benchmark.statistics.paired_tests import (
-    MIN_ERROR,
-    build_log_error_table,
-    compare_pair,
-    correct_holm,
-)
+from bench.benchmark.statistics.error_curves import MIN_ERROR, RunCurves, build_log_error_table
+from bench.benchmark.statistics.paired_tests import compare_pair, correct_holm
 from bench.core.random_streams import make_rng
 from sims.core.simulator import Array
 
@@ -439,3 +434,24 @@ def _compute_mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> floa
             )
         )
     return float(np.nanmean(taus))
+
+
+def compute_friedman_p_value(errors: Array) -> float:
+    """Compute the p-value of Friedman's test that all tuners perform equally, over targets.
+
+    A tuner that failed on a target has the worst rank there. Errors are compared as rounded
+    logarithms, so that rounding errors do not break ties.
+
+    Args:
+        errors: errors, (targets, tuners); NaN for a failed run.
+
+    Returns:
+        The p-value; NaN with too few targets or fewer than three tuners.
+    """
+    from scipy.stats import friedmanchisquare
+
+    targets, tuners = errors.shape
+    if targets < MIN_PROBLEMS_FOR_RANKS or tuners < 3:
+        return float("nan")
+    worst = np.where(np.isfinite(errors), errors, np.inf)
+    return float(friedmanchisquare(*np.log(np.maximum(worst, 1e-12)).round(9).T).pvalue)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from bench.benchmark.storage.table_schemas import Columns, ColumnSpec, EmptyCellRule
 from sims.core.files import get_first_line
-from sims.core.simulator import InputError
 from sims.core.toml_validation import format_value
 
 if TYPE_CHECKING:
-    import pandas as pd
     import pyarrow as pa
 
 
@@ -265,74 +263,3 @@ def _raise_for_bad_row(
     if is_bad.any():
         row = int(is_bad.argmax())
         raise CellError(row, column.name, expected or column.expected_text, describe_row(row))
-
-
-RowErrorFactory = Callable[[int, str], InputError]
-"""Makes the error for a row of a file, counted from 0."""
-TableErrorFactory = Callable[[int | None, str], InputError]
-"""Makes the error for a row of a file, counted from 0, or for the whole file (None)."""
-
-
-def raise_for_first_bad_row(
-    bad: pd.Series | Mask, make_error: RowErrorFactory, describe_row: Callable[[int], str]
-) -> None:
-    """Raise an error for the first bad row.
-
-    Args:
-        bad: Mask of bad rows.
-        make_error: Makes the error.
-        describe_row: Describes what is wrong in a row.
-
-    Raises:
-        InputError: There is a bad row.
-    """
-    mask = np.asarray(bad, dtype=bool)
-    if mask.any():
-        row = int(mask.argmax())
-        raise make_error(row, describe_row(row))
-
-
-def check_known(
-    values: pd.Series, known_values: Iterable[str], column: str, make_error: RowErrorFactory
-) -> None:
-    """Reject values that the experiment does not define.
-
-    Args:
-        values: Values to check.
-        known_values: Values that the experiment defines.
-        column: Name of the quantity.
-        make_error: Makes the error.
-
-    Raises:
-        InputError: There is an unknown value.
-    """
-    raise_for_first_bad_row(
-        ~values.isin(list(known_values)),
-        make_error,
-        lambda row: (
-            f"{column}: expected one of experiment.toml, found {format_value(values.iloc[row])}"
-        ),
-    )
-
-
-def check_equal(
-    found: pd.Series, expected: pd.Series, name: str, why: str, make_error: RowErrorFactory
-) -> None:
-    """Reject values that differ from the expected ones; two missing values are equal.
-
-    Args:
-        found: Values to check.
-        expected: Expected values.
-        name: Name of the column.
-        why: Reason for the expected values.
-        make_error: Makes the error.
-
-    Raises:
-        InputError: A value differs.
-    """
-    is_different = found.to_numpy() != expected.to_numpy()
-    raise_for_first_bad_row(
-        is_different & ~(found.isna() & expected.isna()).to_numpy(),
-        make_error,
-        lambda i: f"{name}: expected {expected[i]} {why}, found {found[i]}",
-    )

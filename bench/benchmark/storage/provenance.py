@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+import shlex
 import sys
 from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
@@ -127,3 +128,23 @@ def compute_sha256(path: Path) -> str:
         while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
+
+
+def format_repeated_explain_command(folder: Path) -> str:
+    """Build the command that reproduces an explanation, as far as its folder states it.
+
+    Args:
+        folder: Folder of an explanation, with the record of its settings and recordings.
+
+    Returns:
+        Command line for a shell.
+    """
+    environment = read_environment(folder)
+    # The descriptions of recordings (.toml) are listed too, but are not arguments of the command.
+    tables = [
+        recording["file"]
+        for recording in environment.get("recordings", [])
+        if not recording["file"].endswith(".toml")
+    ]
+    words = format_explain_command(tables or ["RECORDING.csv"], environment.get("settings", {}))
+    return shlex.join(words)

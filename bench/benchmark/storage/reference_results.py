@@ -23,7 +23,7 @@ from sims.core.toml_validation import read_toml
 if TYPE_CHECKING:
     import pandas as pd
 
-    from bench.benchmark.problem.experiment import Experiment
+    from bench.benchmark.problem.experiment_config import Experiment
 
 _PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 REFERENCE_FOLDERS = (

@@ -3,41 +3,54 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.experiment_tables import TunerEntry
+from bench.benchmark.problem.experiment_config import Experiment, TunerEntry
 from bench.benchmark.storage.cell_validation import (
-    RowErrorFactory,
-    TableErrorFactory,
-    check_equal,
-    check_known,
-    raise_for_first_bad_row,
+    CellError,
+    Mask,
+    check_cells,
+    parse_parquet_column,
+    select_declared_columns,
+    to_numpy_mask,
 )
-from bench.benchmark.storage.csv_reader import CsvTable, RunsTable
+from bench.benchmark.storage.csv_reader import CsvTable
 from bench.benchmark.storage.run_journal import JOURNAL_REMEDY
 from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES, RunStatus
 from bench.benchmark.storage.table_schemas import (
     ERROR_TABLE_COLUMNS,
     IDENTIFIABILITY_COLUMNS,
+    RUN_COLUMNS,
+    RUN_CONSTANT_COLUMNS,
     STATUS_COLUMNS,
     TRAINING_COLUMNS,
     ColumnSpec,
     expand_columns,
+    list_channels,
+    list_parameters,
 )
 from bench.core.plugin_registries import tuners
+from sims.core.files import get_first_line
 from sims.core.simulator import InputError
 from sims.core.toml_validation import format_value
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 
 _SEED_PATTERN = re.compile("[0-9]{1,9}")
+
+RowErrorFactory = Callable[[int, str], InputError]
+"""Makes the error for a row of a file, counted from 0."""
+
+TableErrorFactory = Callable[[int | None, str], InputError]
+"""Makes the error for a row of a file, counted from 0, or for the whole file (None)."""
 
 
 def list_target_names(experiment: Experiment) -> list[str]:
@@ -511,3 +524,250 @@ def check_journal_statuses(
             make_status_error,
         )
     return statuses
+
+
+class RunsTable(NamedTuple):
+    """A file of runs.
+
+    Attributes:
+        path: Path of the file.
+        remedy: Advice for a damaged file.
+        rows: Rows that were read already, for a file that is not Parquet; otherwise None.
+        first_row: Number of the first of these rows in the file.
+    """
+
+    path: Path
+    remedy: str
+    rows: pa.Table | None = None
+    first_row: int = 0
+
+    def make_error(self, row: int | None, problem: str) -> InputError:
+        """Make the error for a row, counted from 0, or for the whole file.
+
+        Args:
+            row: Row, or None for the file.
+            problem: What is wrong.
+        """
+        row_text = "" if row is None else f", row {self.first_row + row}"
+        return InputError(f"{self.path}{row_text}: {problem}; {self.remedy}")
+
+    def read_runs(self, experiment: Experiment) -> pd.DataFrame:
+        """Check all rows, and return one line per run, in the order of the file.
+
+        Each line has the columns that are constant within the run, ``row``, at which it begins, and
+        ``used``, its last k. Columns are read one by one, since all of many rows would not fit in
+        memory.
+
+        Args:
+            experiment: Experiment of the runs.
+
+        Raises:
+            InputError: The file is damaged; the message is one line.
+        """
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        try:
+            if self.rows is not None:
+                return _read_checked_runs(self.rows.select, self.rows.column_names, experiment)
+            with parquet.ParquetFile(self.path) as file:
+                names = list(file.schema_arrow.names)
+                return _read_checked_runs(
+                    lambda columns: file.read(columns=columns), names, experiment
+                )
+        except CellError as error:
+            raise self.make_error(error.row, error.says) from None
+        # In a damaged file even the names of columns may be invalid text.
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+            raise self._make_read_error(error) from None
+
+    def _make_read_error(self, error: Exception) -> InputError:
+        """Make the one-line error for a file that is missing, or is not a Parquet file."""
+        missing = isinstance(error, FileNotFoundError)
+        reason = (
+            "no such file" if missing else f"expected a Parquet file, found {get_first_line(error)}"
+        )
+        return InputError(f"{self.path}: not a complete comparison: {reason}; {self.remedy}")
+
+
+def declare_run_columns(names: list[str], experiment: Experiment) -> list[ColumnSpec]:
+    """Return the columns that the runs of an experiment must have, with their types and limits.
+
+    Some columns exist once for each parameter or channel: those that the names of the file's
+    columns contain and those of the experiment. If there are none, these columns keep the
+    placeholder PARAMETER or CHANNEL of `table_schemas` in their names.
+
+    Args:
+        names: Names of the file's columns.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
+    """
+    parameters = dict.fromkeys([*list_parameters(names), *experiment.parameters])
+    channels = experiment.observe or list_channels(names)
+    columns = expand_columns(RUN_COLUMNS, parameters or ["PARAMETER"], channels or ["CHANNEL"])
+    # A single parameter also has its error in its own unit.
+    return [c for c in columns if c.name != "param_abs_error" or len(parameters) == 1]
+
+
+def _read_checked_runs(
+    read_columns: Callable[[list[str]], pa.Table], names: list[str], experiment: Experiment
+) -> pd.DataFrame:
+    """Check rows of runs and return one line per run; see `RunsTable.read_runs`.
+
+    A run has one row for each number of simulations k, in consecutive rows.
+
+    Args:
+        read_columns: Reads columns by their names.
+        names: Names of the columns.
+        experiment: Experiment of the runs.
+
+    Returns:
+        One line per run: its constant columns, ``row``, at which it begins, and ``used``, its last
+        k.
+
+    Raises:
+        CellError: A cell or a run violates its declaration.
+    """
+    import pandas as pd
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if not names:  # Without runs there are no columns.
+        return pd.DataFrame(columns=["run", *RUN_CONSTANT_COLUMNS, "row", "used"])
+    columns = select_declared_columns(names, declare_run_columns(names, experiment))
+    declared = {column.name: column for column in columns}
+
+    def read(name: str) -> pa.Array:
+        return parse_parquet_column(declared[name], read_columns([name])[name])
+
+    run, k = read("run"), read("k").to_numpy()
+    is_recording = to_numpy_mask(compute.equal(read("range"), "real"))
+    is_run_start = np.ones(len(k), dtype=bool)
+    is_run_start[1:] = _find_changes(run)
+    _check_counts(run, k, is_run_start)
+    rows = np.flatnonzero(is_run_start)
+    constants = {"run": run.take(rows)}
+    for name, column in declared.items():
+        values = read(name)
+        check_cells(column, values, k == 0, is_recording)
+        if name in RUN_CONSTANT_COLUMNS or name.startswith("true_"):
+            _check_constant(name, values, ~is_run_start[1:])
+            constants[name] = values.take(rows)
+    # k counts without gaps, so the number of rows gives the last k.
+    used = np.diff(np.append(rows, len(k))) - 1
+    runs: pd.DataFrame = pa.table(constants).to_pandas().assign(row=rows, used=used)
+    is_repeated = runs["run"].duplicated().to_numpy(dtype=bool)
+    if is_repeated.any():
+        repeated = int(is_repeated.argmax())
+        name = runs["run"][repeated]
+        raise CellError(int(rows[repeated]), "run", "every run once", f"{name} again")
+    return runs
+
+
+def _find_changes(values: pa.Array) -> Mask:
+    """Return an (n - 1,) mask of values that differ from the previous one; NaN equals NaN."""
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if pa.types.is_floating(values.type):
+        numbers = values.to_numpy()
+        is_both_missing = np.isnan(numbers[1:]) & np.isnan(numbers[:-1])
+        is_changed: Mask = (numbers[1:] != numbers[:-1]) & ~is_both_missing
+        return is_changed
+    return to_numpy_mask(compute.not_equal(values[1:], values[:-1]))
+
+
+def _check_counts(run: pa.Array, k: NDArray[np.int64], is_run_start: Mask) -> None:
+    """Check that k, the number of simulations, counts 0, 1, 2, ... in the rows of every run.
+
+    Raises:
+        CellError: k has another value, so that a row is missing or added.
+    """
+    # The value of the row before plus one; the first row, to which `roll` wraps around, is a start.
+    expected = np.where(is_run_start, 0, np.roll(k, 1) + 1)
+    is_wrong = k != expected
+    if is_wrong.any():
+        row = int(is_wrong.argmax())
+        raise CellError(row, "k", f"{expected[row]}, the next of {run[row].as_py()}", str(k[row]))
+
+
+def _check_constant(name: str, values: pa.Array, is_same_run: Mask) -> None:
+    """Check that a column that describes a run, such as tuner and target, is constant within it.
+
+    Args:
+        name: Name of the column.
+        values: (n,) values, in which the rows of a run follow each other.
+        is_same_run: (n - 1,) mask of rows that belong to the run of the row before.
+
+    Raises:
+        CellError: a value differs from the row before.
+    """
+    is_changed = _find_changes(values) & is_same_run
+    if is_changed.any():
+        row = int(is_changed.argmax()) + 1
+        before, found = values[row - 1].as_py(), values[row].as_py()
+        raise CellError(row, name, f"{before} as in the row before", str(found))
+
+
+def raise_for_first_bad_row(
+    bad: pd.Series | Mask, make_error: RowErrorFactory, describe_row: Callable[[int], str]
+) -> None:
+    """Raise an error for the first bad row.
+
+    Args:
+        bad: Mask of bad rows.
+        make_error: Makes the error.
+        describe_row: Describes what is wrong in a row.
+
+    Raises:
+        InputError: There is a bad row.
+    """
+    mask = np.asarray(bad, dtype=bool)
+    if mask.any():
+        row = int(mask.argmax())
+        raise make_error(row, describe_row(row))
+
+
+def check_known(
+    values: pd.Series, known_values: Iterable[str], column: str, make_error: RowErrorFactory
+) -> None:
+    """Reject values that the experiment does not define.
+
+    Args:
+        values: Values to check.
+        known_values: Values that the experiment defines.
+        column: Name of the quantity.
+        make_error: Makes the error.
+
+    Raises:
+        InputError: There is an unknown value.
+    """
+    raise_for_first_bad_row(
+        ~values.isin(list(known_values)),
+        make_error,
+        lambda row: (
+            f"{column}: expected one of experiment.toml, found {format_value(values.iloc[row])}"
+        ),
+    )
+
+
+def check_equal(
+    found: pd.Series, expected: pd.Series, name: str, why: str, make_error: RowErrorFactory
+) -> None:
+    """Reject values that differ from the expected ones; two missing values are equal.
+
+    Args:
+        found: Values to check.
+        expected: Expected values.
+        name: Name of the column.
+        why: Reason for the expected values.
+        make_error: Makes the error.
+
+    Raises:
+        InputError: A value differs.
+    """
+    is_different = found.to_numpy() != expected.to_numpy()
+    raise_for_first_bad_row(
+        is_different & ~(found.isna() & expected.isna()).to_numpy(),
+        make_error,
+        lambda i: f"{name}: expected {expected[i]} {why}, found {found[i]}",
+    )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bench import __version__
-from bench.benchmark.problem.experiment import Experiment, parse_experiment
+from bench.benchmark.problem.experiment_config import Experiment, parse_experiment
 from bench.benchmark.problem.targets import Redraws
 from bench.benchmark.storage.provenance import describe_machine, get_utc_time, list_package_versions
 from bench.benchmark.storage.result_file_consistency import check_files, check_table
@@ -31,9 +31,8 @@ from sims.core.files import (
     make_timestamped_path,
     write_atomically,
 )
-from sims.core.plain_values import to_toml_value
 from sims.core.simulator import InputError
-from sims.core.toml_validation import check_entries, format_value, read_toml
+from sims.core.toml_validation import check_entries, format_value, read_toml, to_toml_value
 from sims.engines.engine_lookup import describe_stepping
 
 if TYPE_CHECKING:

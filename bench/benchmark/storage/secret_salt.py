@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.storage.result_folder import SALT_FILE, read_configuration, write_configuration
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.core.random_streams import (

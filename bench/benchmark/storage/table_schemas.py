@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
-from bench.benchmark.problem.experiment import RANGES
+from bench.benchmark.problem.experiment_config import RANGES
 from bench.benchmark.storage.run_status import STATUSES
 
 SHOT_STATUSES = (*STATUSES, "no plan", "no recording")

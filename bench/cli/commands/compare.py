@@ -68,7 +68,7 @@ def _begin_or_resume(options: argparse.Namespace, print_line: PrintLine) -> list
     """
     from bench.api.compare import begin_studies, build_experiment
     from bench.api.comparison_options import ComparisonOptions
-    from bench.studies.study import list_study_folders, resume_study
+    from bench.studies.study_kinds import list_study_folders, resume_study
     from sims.core.argument_checks import check_options
     from sims.core.simulator import InputError
 
@@ -105,7 +105,7 @@ def _run_compare(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     Returns:
         The JSON document of the command, and the largest exit code of its comparisons.
     """
-    from bench.studies.study import report_jointly
+    from bench.studies.study_kinds import report_jointly
 
     # Connect to the cluster first, so that an unreachable scheduler leaves no folder.
     pool = make_cluster_pool(options.cluster)
@@ -136,8 +136,8 @@ def _run_study(
         options: parsed command line.
         print_line: prints one line of text.
     """
+    from bench.cli.output import summarise_study
     from bench.cli.progress_display import ProgressBars
-    from bench.cli.study_summary import summarise_study
 
     with ProgressBars() as bars:
         outcome = study.run(options.jobs, bars.start_bar, pool)

@@ -44,7 +44,7 @@ def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
     """
     import shtab
 
-    from bench.benchmark.problem import experiment
+    from bench.benchmark.problem import experiment_config
     from bench.core.plugin_registries import REGISTRIES
     from bench.schemas import list_schema_names
 
@@ -52,7 +52,7 @@ def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
         for action in command._actions:
             _set_completion(name, action, shtab)
     names = {
-        "experiments": experiment.list_experiment_names(),
+        "experiments": experiment_config.list_experiment_names(),
         "parts": [name for registry in REGISTRIES for name in registry.names()],
         "schemas": list_schema_names(),
     }

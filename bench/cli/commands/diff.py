@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, PrintLine
 from bench.cli.shared_options import parse_path
+from bench.studies.result_diff import compare_folders
 
 if TYPE_CHECKING:
-    from bench.studies.diff_comparisons import ComparisonDiff
-    from bench.studies.diff_explanations import ExplanationDiff
+    pass
 
 
 def add_diff_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +51,7 @@ def _run_diff(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
 
     if options.out is not None:
         check_absent([options.out])
-    difference = _compare_folders(options.a, options.b)
+    difference = compare_folders(options.a, options.b)
     fails = options.fail_on == "worse" and difference.is_worse
     fails = fails or (options.fail_on == "change" and difference.has_changed)
     for line in difference.format_lines():
@@ -61,31 +60,3 @@ def _run_diff(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
         write_files({options.out: difference.to_table().to_csv(index=False)})
         print_line(f"table   {options.out}")
     return CommandResult(difference.to_document(), EXIT_PROBLEMS_FOUND if fails else EXIT_OK)
-
-
-def _compare_folders(a: Path, b: Path) -> ComparisonDiff | ExplanationDiff:
-    """Compare two folders of one kind.
-
-    Args:
-        a: folder of the first comparison or explanation.
-        b: folder of the second one.
-
-    Raises:
-        InputError: They are of two kinds, or one is neither.
-    """
-    from bench.studies import diff_comparisons, diff_explanations
-    from bench.studies.explanation_verification import VERDICT_FILE
-    from sims.core.simulator import InputError
-
-    is_explanation = [(folder / VERDICT_FILE).is_file() for folder in (a, b)]
-    if all(is_explanation):
-        return diff_explanations.ExplanationDiff(
-            diff_explanations.load_side(a), diff_explanations.load_side(b)
-        )
-    if any(is_explanation):
-        explanation, comparison = (a, b) if is_explanation[0] else (b, a)
-        raise InputError(
-            f"expected two comparisons or two explanations: {explanation} is an explanation, "
-            f"{comparison} is not"
-        )
-    return diff_comparisons.diff_comparisons(a, b)

@@ -7,11 +7,13 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bench.benchmark.problem.missing_requirements import list_dependent_experiments
 from bench.cli.output import CommandResult, JsonDocument, PrintLine
 from bench.cli.shared_options import parse_path
+from bench.datasets.public_datasets import find_present_folder
 
 if TYPE_CHECKING:
-    from bench.datasets.dataset_catalogue import DataSet
+    from bench.datasets.public_datasets import DataSet
 
 _ALL = "all"
 
@@ -55,14 +57,14 @@ def _run_download(options: argparse.Namespace, print_line: PrintLine) -> Command
     Returns:
         The JSON document of the command, and its exit code (0).
     """
-    from bench.datasets import dataset_catalogue
+    from bench.datasets import public_datasets
 
     names_to_download = (
-        dataset_catalogue.names() if _ALL in options.names else list(dict.fromkeys(options.names))
+        public_datasets.names() if _ALL in options.names else list(dict.fromkeys(options.names))
     )
-    data_sets = [dataset_catalogue.get(name) for name in names_to_download]
+    data_sets = [public_datasets.get(name) for name in names_to_download]
     if not data_sets:
-        catalogue = [dataset_catalogue.get(name) for name in dataset_catalogue.names()]
+        catalogue = [public_datasets.get(name) for name in public_datasets.names()]
         for data_set in catalogue:
             for line in _format_data_set(data_set):
                 print_line(line)
@@ -71,7 +73,7 @@ def _run_download(options: argparse.Namespace, print_line: PrintLine) -> Command
         )
     downloaded = []
     for data_set in data_sets:
-        present_folder = _find_present_folder(data_set, options.out)
+        present_folder = find_present_folder(data_set, options.out)
         if present_folder:
             print_line(f"{data_set.name}: already in {present_folder}")
             continue
@@ -79,7 +81,7 @@ def _run_download(options: argparse.Namespace, print_line: PrintLine) -> Command
         downloaded.append(data_set.name)
         if options.out:
             print_line(_explain_folder_lookup(data_set, options.out))
-        for name in _list_dependent_experiments(data_set):
+        for name in list_dependent_experiments(data_set):
             print_line(f"needed by: simgap compare {name}")
     documents = [_make_data_set_document(each, options.out) for each in data_sets]
     return CommandResult({"data_sets": documents, "downloaded": downloaded})
@@ -97,8 +99,7 @@ def _download_data_set(data_set: DataSet, source: str, target_folder: Path | Non
 
     from tqdm import tqdm
 
-    from bench.datasets.dataset_catalogue import list_search_folders
-    from bench.datasets.dataset_download import download
+    from bench.datasets.public_datasets import download, list_search_folders
 
     with tqdm(
         total=data_set.bytes,
@@ -118,20 +119,6 @@ def _download_data_set(data_set: DataSet, source: str, target_folder: Path | Non
         )
 
 
-def _find_present_folder(data_set: DataSet, target_folder: Path | None) -> Path | None:
-    """Return the folder of a data set that is already present; None if it must be downloaded.
-
-    Args:
-        data_set: data set of the catalogue: its files, source and licence.
-        target_folder: folder below which it may be; None for the usual ones.
-    """
-    if target_folder is None:
-        return data_set.folder()
-    # In a named folder the files themselves are looked for.
-    folder = target_folder / data_set.name
-    return folder if all((folder / file).is_file() for file in data_set.provides) else None
-
-
 def _explain_folder_lookup(data_set: DataSet, target_folder: Path) -> str:
     """Explain how experiments find a data set in a folder other than the default one.
 
@@ -139,7 +126,7 @@ def _explain_folder_lookup(data_set: DataSet, target_folder: Path) -> str:
         data_set: data set of the catalogue: its files, source and licence.
         target_folder: folder below which it is stored.
     """
-    from bench.datasets.dataset_catalogue import FOLDER_VARIABLES, list_search_folders
+    from bench.datasets.public_datasets import FOLDER_VARIABLES, list_search_folders
 
     if target_folder.resolve() in [
         folder.resolve() for folder in list_search_folders(data_set.kind)
@@ -155,29 +142,13 @@ def _format_data_set(data_set: DataSet) -> list[str]:
     """Format a data set for the list: size, licence, place, title, experiments and source."""
     folder = data_set.folder()
     state = f"in {folder}" if folder else f"not here: run `{data_set.command}`"
-    experiment_names = ", ".join(_list_dependent_experiments(data_set))
+    experiment_names = ", ".join(list_dependent_experiments(data_set))
     return [
         f"{data_set.name:22} {data_set.size:>7}  {data_set.licence:11} {state}",
         f"  {data_set.title}",
         f"  needed by {experiment_names}",
         f"  {data_set.repository} at {data_set.commit[:7]}; {data_set.cite}",
     ]
-
-
-def _list_dependent_experiments(data_set: DataSet) -> list[str]:
-    """Return the names of the project's experiments that need a data set."""
-    from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
-    from bench.datasets.dataset_catalogue import find_providing_data_set
-
-    names = []
-    for name in list_experiment_names():
-        experiment = load_experiment(name)
-        paths = [("robot", experiment.model)]
-        if experiment.recording:
-            paths.append(("recording", experiment.recording.path))
-        if data_set in [find_providing_data_set(*path) for path in paths]:
-            names.append(name)
-    return names
 
 
 def _make_data_set_document(data_set: DataSet, target_folder: Path | None = None) -> JsonDocument:
@@ -204,6 +175,6 @@ def _make_data_set_document(data_set: DataSet, target_folder: Path | None = None
             for file in data_set.files
         ],
         "provides": list(data_set.provides),
-        "folder": _find_present_folder(data_set, target_folder),
-        "experiments": _list_dependent_experiments(data_set),
+        "folder": find_present_folder(data_set, target_folder),
+        "experiments": list_dependent_experiments(data_set),
     }

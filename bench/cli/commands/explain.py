@@ -167,7 +167,7 @@ def _run_explain_batch(options: argparse.Namespace, print_line: PrintLine) -> Co
         options: parsed arguments of the command.
         print_line: prints one line of text.
     """
-    from bench.benchmark.runner.plugin_discovery import Plugin
+    from bench.benchmark.runner.plugin_inspection import Plugin
     from bench.benchmark.runner.worker_pools import make_pool
     from bench.benchmark.storage.provenance import get_utc_time
     from bench.cli.progress_display import ProgressDisplay
@@ -252,8 +252,12 @@ def _report_batch(
         format_explain_command,
         write_explanation_environment,
     )
-    from bench.diagnosis.many_logs import LOGS_TABLE_FILE, summarise_causes
-    from bench.diagnosis.many_logs_page import BatchPageInput, write_summary_page
+    from bench.diagnosis.many_logs import (
+        LOGS_TABLE_FILE,
+        BatchPageInput,
+        summarise_causes,
+        write_summary_page,
+    )
 
     remaining = len(logs) - len(log_results)
     folders = {log.name: log.folder for log in logs}

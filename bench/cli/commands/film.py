@@ -99,7 +99,7 @@ def run_track(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
         print_line: Prints a line of text.
     """
     from bench.figures.ball_track_figure import render_track_figure
-    from bench.logs.film_tracking import track_film
+    from bench.logs.ball_heights_from_film import track_film
 
     diameter, fps, scale = options.ball_diameter, options.fps, options.scale
     track = track_film(

@@ -45,7 +45,7 @@ def _run_import(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
     Returns:
         The JSON document of the command, and its exit code (0).
     """
-    from bench.api.recordings import ImportRequest, import_logs
+    from bench.logs.importing.log_import import ImportRequest, import_logs
 
     imported = import_logs(**collect_options(options, ImportRequest))
     print_line(

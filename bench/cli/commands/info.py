@@ -40,7 +40,7 @@ def collect_info() -> JsonDocument:
     from bench import __version__
     from bench.benchmark.runner.trained_weights import get_weights_folder
     from bench.core.resource_estimates import count_available_cores
-    from bench.datasets.dataset_catalogue import get_user_folder
+    from bench.datasets.public_datasets import get_user_folder
 
     return {
         "simgap": __version__,

@@ -16,6 +16,7 @@ from bench.cli.shared_options import (
     parse_name_list,
     parse_path,
 )
+from bench.logs.quality import log_quality
 
 if TYPE_CHECKING:
     from bench.diagnosis.conventions.convention_comparison import ConventionDifference
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 def add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap inspect`."""
-    from bench.logs.recording_loading import FrameDescription
+    from sims.recording.recording_frame import FrameDescription
 
     parser.add_argument(
         "recording",
@@ -144,10 +145,9 @@ def _list_warnings(recording: Recording, kind: type[Simulator]) -> list[str]:
         recording: recorded runs, with their channels, inputs and constants.
         kind: simulator class.
     """
-    from bench.logs import recording_summary
     from bench.logs.quality.clock_checks import find_anomalies
     from bench.logs.quality.log_quality import find_log_anomalies
-    from bench.logs.quality.pose_check import find_missing_base_poses
+    from bench.logs.quality.pose_checks import find_missing_base_poses
 
     oddities = [
         *find_log_anomalies(recording),
@@ -156,7 +156,7 @@ def _list_warnings(recording: Recording, kind: type[Simulator]) -> list[str]:
     ]
     return [
         *(oddity.text for oddity in oddities),
-        *recording_summary.format_log_warnings(recording, kind),
+        *log_quality.format_log_warnings(recording, kind),
     ]
 
 
@@ -245,7 +245,8 @@ def _print_identifiability(
         options: parsed arguments of the command.
         print_line: prints one line of text.
     """
-    from bench.diagnosis.identifiability import check_identifiability, format_identifiability
+    from bench.diagnosis.identifiability import check_identifiability
+    from bench.diagnosis.report.identifiability_section import format_identifiability
 
     free = parse_name_list(options.free or "")
     numbers = check_identifiability(options.recording, options.system, options.model, free)

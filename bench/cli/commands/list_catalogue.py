@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from bench.cli.output import EXIT_CODES, CommandResult, JsonDocument, PrintLine, format_json
 from bench.cli.shared_options import add_plugin_option, get_subparsers, parse_path
-from sims.core.plain_values import append_unit, format_unit
+from sims.core.user_messages import append_unit, format_unit
 
 if TYPE_CHECKING:
     from sims.robot.robot_simulator import RobotSimulator
@@ -233,12 +233,12 @@ def list_experiments() -> list[JsonDocument]:
         One document per experiment; `skipped` and `needs` say what is missing here,
         `tuners_skipped` which tuners cannot run.
     """
-    from bench.benchmark.problem import experiment
+    from bench.benchmark.problem import experiment_config
     from bench.benchmark.problem.missing_requirements import availability
 
     documents = []
-    for name in experiment.list_experiment_names():
-        listed = experiment.load_experiment(name)
+    for name in experiment_config.list_experiment_names():
+        listed = experiment_config.load_experiment(name)
         missing = availability(listed)
         documents.append(
             {

@@ -55,10 +55,10 @@ def _run_plot(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     Returns:
         The JSON document of the command, and its exit code (0).
     """
-    from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+    from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
     from bench.benchmark.storage.reference_results import find_reference
-    from bench.studies.study import list_study_folders, open_study
-    from bench.suite.suite_page import report_suite
+    from bench.studies.study_kinds import list_study_folders, open_study
+    from bench.suite.suite_report import report_suite
     from bench.suite.suite_runs import is_stored_suite
     from sims.core.simulator import InputError
 
@@ -110,8 +110,8 @@ def _report_again(
         references: reference results that are drawn behind the figures.
         print_line: prints one line of text.
     """
-    from bench.cli.study_summary import summarise_study
-    from bench.studies.study import list_study_folders, open_study, report_jointly
+    from bench.cli.output import summarise_study
+    from bench.studies.study_kinds import list_study_folders, open_study, report_jointly
 
     comparisons = []
     for part in list_study_folders(folder):
@@ -174,6 +174,6 @@ def _draw_with_references(
     """
     if not references:
         return []
-    from bench.benchmark.comparison_report import draw_with_references
+    from bench.benchmark.comparison_printed_figures import draw_with_references
 
     return draw_with_references(folder, references, output_folder, print_line, name)

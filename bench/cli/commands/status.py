@@ -42,7 +42,7 @@ def _run_status(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a study is not
         complete.
     """
-    from bench.studies.study import list_study_folders, open_study
+    from bench.studies.study_kinds import list_study_folders, open_study
 
     if options.run is None:
         return CommandResult({"seals": _print_isolation_layers(print_line)})
@@ -57,7 +57,7 @@ def _run_status(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
 def _print_isolation_layers(print_line: PrintLine) -> list[JsonDocument]:
     """Print which isolation layers are available on this machine."""
     from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
-    from bench.benchmark.runner.tuner_process_reuse import list_active_isolation_layers
+    from bench.benchmark.runner.tuner_process_start import list_active_isolation_layers
 
     active_layers = list_active_isolation_layers()
     print_line("isolation layers of a tuner's process on this machine (docs/isolation.md)")

@@ -1,7 +1,7 @@
 """Compare conventions of a robot's log by the model's own prediction errors.
 
 A Kalman filter with the model follows the log under each hypothesis
-(`bench.diagnosis.kalman.filter_and_smoother`). Hypotheses are compared by the likelihood of the
+(`bench.diagnosis.kalman.kalman_recursions`). Hypotheses are compared by the likelihood of the
 recorded values y,
 
     log L(y | hypothesis) = log L(transformed y) + Σ_c N_c log |k_c|                             (1)
@@ -32,16 +32,15 @@ from bench.diagnosis.conventions.convention_hypotheses import (
     ConventionHypothesis,
     HypothesisGenerator,
     JointSignals,
-    find_copied_commands,
 )
 from bench.diagnosis.conventions.signal_changes import SignalChange
 from bench.diagnosis.conventions.unit_check import Subject
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
+from bench.diagnosis.dry_friction_form import make_soft_kind
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.friction_form_verdict import make_soft_kind
+from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
 from bench.diagnosis.kalman.candidate_responses import compute_columns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.kalman.linearised_filter import MAX_LINEARISATIONS, FollowedRuns
@@ -56,7 +55,8 @@ from bench.diagnosis.prediction_error.regression_columns import group_coefficien
 from bench.diagnosis.prediction_error.regression_selection import Selected, identify
 from bench.diagnosis.search.candidate_directions import iterate_first_probes
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
-from sims.core.plain_values import join_first_names
+from bench.logs.quality.servo_checks import find_copied_commands
+from sims.core.user_messages import join_first_names
 from sims.recording.recording import Recording, Run
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import RobotSimulator

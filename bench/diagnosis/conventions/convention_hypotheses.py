@@ -14,22 +14,17 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.diagnosis.conventions.signal_changes import SignalChange, change_signals
+from bench.diagnosis.conventions.signal_changes import SignalChange, advance_inputs, change_signals
 from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, DescribedSignal, Subject
 from bench.logs.importing.joint_order import find_best_order
 from bench.logs.importing.normalised_positions import compute_range_scale
-from sims.core.plain_values import join_first_names
-from sims.core.simulator import Array, InputError, Simulator
-from sims.recording.column_mapping import list_mapped_files
-from sims.recording.log_formats.log_columns import LogFile
-from sims.recording.log_formats.log_files import read_log
-from sims.recording.recording import Recording, Run
-from sims.recording.recording_description import read_meta
+from sims.core.simulator import Array
+from sims.core.user_messages import join_first_names
+from sims.recording.recording import Recording
 
 TRIED_ZERO_OFFSETS = (
     np.array([-120.0, -70.0, -35.0, -15.0, 15.0, 35.0, 70.0, 120.0, 180.0]) * math.pi / 180.0
@@ -89,7 +84,7 @@ class ConventionHypothesis:
         changed = change_signals(recording, self.changes)
         runs = [replace(run, initial={}) if self.changes else run for run in changed.runs]
         if self.late:
-            runs = [_advance_inputs(run, self.late) for run in runs]
+            runs = [advance_inputs(run, self.late) for run in runs]
         return replace(changed, runs=tuple(runs))
 
     def add_offset_step(self, step: float) -> ConventionHypothesis:
@@ -99,36 +94,6 @@ class ConventionHypothesis:
             for name, change in self.changes.items()
         }
         return replace(self, changes=changes)
-
-
-def _advance_inputs(run: Run, delay: float) -> Run:
-    """Return a run with its inputs moved to earlier times by a delay in s.
-
-    The end of the run is cut off, because its new inputs were not recorded. Samples are moved
-    instead of the offset of the time stamps, because a part of a run contains no inputs after its
-    end. Inputs that are linear between samples are interpolated; others hold their last value.
-
-    Args:
-        run: recorded run; `run.linear` names the inputs that are linear between samples.
-        delay: delay of the command time stamps in s, positive.
-    """
-    shifted_times = run.times + delay
-    # Samples whose new input was recorded, with half a delay of tolerance; a run has at least two.
-    count = int(np.searchsorted(shifted_times, run.times[-1] + 0.5 * delay, side="right"))
-    count = min(max(count, 2), run.times.size)
-    inputs = {}
-    for name, values in run.inputs.items():
-        if name in run.linear:
-            advanced = np.interp(shifted_times, run.times, values)
-        else:
-            # Index of the last sample up to the shifted time; the tolerance is for stamps that
-            # differ by rounding.
-            last_indices = (
-                np.searchsorted(run.times, shifted_times + 1e-6 * delay, side="right") - 1
-            )
-            advanced = values[last_indices]
-        inputs[name] = advanced
-    return replace(run, inputs=inputs).part(slice(0, count))
 
 
 @dataclass(frozen=True)
@@ -534,120 +499,3 @@ def _generate_late_commands(recording: Recording) -> Iterator[ConventionHypothes
         late = count * interval
         text = f"commands look stamped {late:.4g} s late: the robot answers before them"
         yield ConventionHypothesis(text, late=late)
-
-
-UNKNOWN_COLUMN = "NAME OF ITS COLUMN"
-"""Stands for the column of a command where no column of the log can be it."""
-MIN_SAMPLES = 20
-"""Minimum number of samples, and of different values, that are compared."""
-MIN_CORRELATION = 0.9
-"""Minimum correlation of a position with the column that may be its command."""
-MEASURED_QUANTITIES = {"position": "q", "velocity": "qd"}
-"""Channel that a servo controls, by the kind of its actuator."""
-
-
-def find_copied_commands(
-    recording: Recording, kind: type[Simulator]
-) -> Iterator[tuple[str, str, str]]:
-    """Yield the commands of servos that equal the measurement of their joint in all samples.
-
-    Such a log does not contain the command: a servo whose command equals its position exerts no
-    force.
-
-    Args:
-        recording: Recording of a robot.
-        kind: Simulator class of the robot.
-
-    Yields:
-        Name of the input, name of the channel that it equals, and the column that may be the
-        command instead, `UNKNOWN_COLUMN` if there is none.
-    """
-    robot: Any = kind.robot  # type: ignore[attr-defined]
-    for actuator in robot.actuators:
-        # A position servo is compared with the position, a velocity servo with the velocity.
-        quantity = MEASURED_QUANTITIES.get(actuator.kind)
-        command, channel = f"u.{actuator.name}", f"{quantity}.{actuator.joint}"
-        runs = [run for run in recording.runs if command in run.inputs and channel in run.channels]
-        if not runs:
-            continue
-        command_values = np.concatenate([run.inputs[command] for run in runs])
-        measured_values = np.concatenate([run.channels[channel] for run in runs])
-        is_recorded = np.isfinite(measured_values)
-        command_values, measured_values = command_values[is_recorded], measured_values[is_recorded]
-        # The readings of a joint that hardly moves may equal its command anyway.
-        if len(np.unique(measured_values)) >= MIN_SAMPLES and np.array_equal(
-            command_values, measured_values
-        ):
-            yield command, channel, _find_likely_column(recording, channel)
-
-
-def _find_likely_column(recording: Recording, channel: str) -> str:
-    """Find the column of the log that is probably the true command of a servo.
-
-    The message proposes it to the user. Of the columns that the description does not use, it is the
-    one with the highest correlation to the recorded position. Return `UNKNOWN_COLUMN` if none
-    correlates enough.
-
-    Args:
-        recording: the recording, with its description and logs.
-        channel: name of the channel with the position.
-    """
-    try:
-        description, meta = read_meta(recording.path)
-    except InputError:  # A recording in memory has no description.
-        return UNKNOWN_COLUMN
-    tables = [table for kind in ("channels", "inputs") for table in meta.get(kind, {}).values()]
-    used_columns = [
-        column for table in tables if isinstance(table, dict) for column in _list_columns(table)
-    ]
-    channel_table = meta.get("channels", {}).get(channel, {})
-    # Without a stated column, the column has the name of the channel.
-    position_column, *_ = _list_columns(channel_table) or [channel]
-    best, best_correlation = UNKNOWN_COLUMN, MIN_CORRELATION
-    # The first log with the position decides.
-    for log in _iterate_logs(description):
-        if position_column not in log.list_columns():
-            continue
-        position = log.get_column(position_column)
-        for column in log.list_columns():
-            if column in (*used_columns, position_column):
-                continue
-            correlation = _compute_correlation(log.get_column(column), position)
-            if correlation > best_correlation:
-                best, best_correlation = column, correlation
-        break
-    return best
-
-
-def _list_columns(table: dict[str, Any]) -> list[str]:
-    """Return the columns that the table of a signal names."""
-    column = table.get("column", [])
-    return [column] if isinstance(column, str) else list(column)
-
-
-def _iterate_logs(description: Path) -> Iterator[LogFile]:
-    """Yield the logs of a description that can be read."""
-    for path in list_mapped_files(description):
-        try:
-            yield read_log(path)
-        except InputError:  # Such as the model file.
-            continue
-
-
-def _compute_correlation(u: Array, y: Array) -> float:
-    """Return the correlation of two columns; 0 if they are equal, or one does not change.
-
-    It is also 0 if the columns have different lengths or fewer than `MIN_SAMPLES` common samples.
-
-    Args:
-        u: (T,) first column, NaN where missing.
-        y: (T,) second column.
-    """
-    # A column that equals a measurement is a copy of it, and not its command.
-    if u.shape != y.shape or np.array_equal(u, y, equal_nan=True):
-        return 0.0
-    is_recorded = np.isfinite(u) & np.isfinite(y)
-    u, y = u[is_recorded], y[is_recorded]
-    if u.size < MIN_SAMPLES or np.ptp(u) == 0 or np.ptp(y) == 0:
-        return 0.0
-    return float(np.corrcoef(u, y)[0, 1])

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from bench.diagnosis.conventions.convention_comparison import ConventionDifference
-from bench.diagnosis.conventions.convention_hypotheses import (
-    UNKNOWN_COLUMN,
-    ConventionHypothesis,
-)
+from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis
 from bench.diagnosis.conventions.signal_changes import SignalChange
+from bench.logs.quality.servo_checks import UNKNOWN_COLUMN
 from sims.core.files import write_files
 from sims.core.simulator import InputError
 from sims.core.toml_validation import join_nested_names, toml_key, toml_text

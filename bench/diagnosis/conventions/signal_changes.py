@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sims.core.angles_and_quaternions import unwrapped
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
-from sims.recording.unit_conversion import unwrapped
 
 
 @dataclass(frozen=True)
@@ -97,3 +97,33 @@ def _change_run(run: Run, changes: Mapping[str, SignalChange]) -> Run:
         inputs=convert(run.inputs, signals),
         before=before,
     )
+
+
+def advance_inputs(run: Run, delay: float) -> Run:
+    """Return a run with its inputs moved to earlier times by a delay in s.
+
+    The end of the run is cut off, because its new inputs were not recorded. Samples are moved
+    instead of the offset of the time stamps, because a part of a run contains no inputs after its
+    end. Inputs that are linear between samples are interpolated; others hold their last value.
+
+    Args:
+        run: recorded run; `run.linear` names the inputs that are linear between samples.
+        delay: delay of the command time stamps in s, positive.
+    """
+    shifted_times = run.times + delay
+    # Samples whose new input was recorded, with half a delay of tolerance; a run has at least two.
+    count = int(np.searchsorted(shifted_times, run.times[-1] + 0.5 * delay, side="right"))
+    count = min(max(count, 2), run.times.size)
+    inputs = {}
+    for name, values in run.inputs.items():
+        if name in run.linear:
+            advanced = np.interp(shifted_times, run.times, values)
+        else:
+            # Index of the last sample up to the shifted time; the tolerance is for stamps that
+            # differ by rounding.
+            last_indices = (
+                np.searchsorted(run.times, shifted_times + 1e-6 * delay, side="right") - 1
+            )
+            advanced = values[last_indices]
+        inputs[name] = advanced
+    return replace(run, inputs=inputs).part(slice(0, count))

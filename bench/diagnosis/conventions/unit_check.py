@@ -37,12 +37,12 @@ from bench.diagnosis.fitting.base_fit import (
     compute_lowest_start_cost,
     fit_base_model,
 )
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
 from bench.diagnosis.verdict import Cause, RecordingFault
-from sims.core.plain_values import join_first_names
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import toml_key
+from sims.core.user_messages import join_first_names
 from sims.recording.recording import Recording
 from sims.recording.recording_description import read_stated_columns
 from sims.system_simulator import SystemSimulator

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -10,11 +9,11 @@ from pathlib import Path
 from bench.diagnosis.datasheet import datasheet_content
 from bench.diagnosis.datasheet.datasheet_content import SheetContent, build_sheet_rows
 from bench.diagnosis.datasheet.datasheet_figure import render_diagram, render_pdf
-from bench.diagnosis.datasheet.datasheet_subject import SheetSubject, make_subject
-from bench.diagnosis.datasheet.detection_limits import compute_detection_limits
-from bench.diagnosis.datasheet.mjcf_class import CLASS_FILE, MjcfFiles, build_mjcf
+from bench.diagnosis.datasheet.datasheet_joint import make_subject
+from bench.diagnosis.datasheet.datasheet_mjcf import CLASS_FILE, MjcfFiles, build_mjcf
+from bench.diagnosis.datasheet.detection_limits import compute_detection_limits, list_absent_effects
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.report import effect_and_unit_text
+from bench.diagnosis.report import cause_and_value_text
 from bench.diagnosis.verdict import Verdict
 from bench.figures.figure_output import FigureFiles
 from bench.logs.filter_settling import leave_out_settling
@@ -23,10 +22,10 @@ from bench.pages.html_page import HtmlPage
 from bench.pages.page_table import Table
 from sims import effects as library
 from sims.core.argument_checks import check_arguments
-from sims.core.effect import ALL_PLACES, Effect
+from sims.core.effect import Effect
 from sims.core.files import Content, write_all_atomically
-from sims.core.plain_values import format_run_names
 from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.user_messages import format_run_names
 from sims.extended_simulator import ExtendedSimulator
 from sims.recording.recording import Recording
 
@@ -66,7 +65,7 @@ def render_page(sheet: SheetContent, diagram: FigureFiles | None, mjcf: MjcfFile
         class_text=mjcf.contents.get(CLASS_FILE, ""),
         notes=mjcf.notes,
         content=datasheet_content,
-        wording=effect_and_unit_text,
+        wording=cause_and_value_text,
     )
 
 
@@ -173,37 +172,6 @@ def build_datasheet(
     return DataSheet(
         name or subject.joint or kind.name, subject, recording, verdict, extended, rows
     )
-
-
-def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> Iterator[str]:
-    """Yield the names of effects that can act at the subject but are not in the model.
-
-    Simpler forms of the effects in the model are left out: a model with Stribeck friction does not
-    lack Coulomb friction. So are effects at all places of a kind at once (families). An effect
-    whose coefficients are all zero counts as absent.
-
-    Args:
-        subject: Joint or system of the sheet.
-        extended: Extended simulator.
-    """
-    local_effects = [
-        effect
-        for name, coefficients in extended.effects.items()
-        for effect, _, fitted_value in subject.localise_effect(name, coefficients)
-        if fitted_value.value != 0
-    ]
-    modelled = {*local_effects, *extended.effects}
-    effect_classes = {effect.name: effect for effect in subject.list_effects()}
-    # An effect names in `contains` the simpler ones to which it reduces if some of its coefficients
-    # are zero.
-    simpler_effects = {
-        contained_effect
-        for name in local_effects
-        for contained_effect in getattr(effect_classes.get(name), "contains", ())
-    }
-    for name in effect_classes:
-        if name not in modelled | simpler_effects and name.partition("@")[2] != ALL_PLACES:
-            yield name
 
 
 def _needs_drive(name: str, effect: Effect | type[Effect]) -> bool:

@@ -10,14 +10,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from bench.diagnosis.datasheet.datasheet_subject import (
+from bench.diagnosis.datasheet.datasheet_joint import (
     PLACE_KIND_TITLES,
-    ModelFileValue,
     SheetSubject,
 )
-from bench.diagnosis.datasheet.detection_limits import DetectionLimit, DetectionLimits
+from bench.diagnosis.datasheet.detection_limits import (
+    DetectionLimit,
+    DetectionLimits,
+    make_limit_from_interval,
+)
 from bench.diagnosis.datasheet.drive_diagram import DriveDiagram, compute_drive_diagram
-from bench.diagnosis.report.effect_and_unit_text import (
+from bench.diagnosis.report.cause_and_value_text import (
     append_unit,
     format_effect_name,
     format_fitted_value,
@@ -259,7 +262,7 @@ class _Rows:
             effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
             number: fitted coefficient, whose interval gives the detection limit.
         """
-        detection_limit = _make_limit_from_interval(
+        detection_limit = make_limit_from_interval(
             number, self.subject.get_model_file_value(effect)
         )
         return SheetRow(
@@ -400,21 +403,6 @@ def _may_be_zero(number: FittedValue) -> bool:
     if number.low is None or number.high is None:
         return False
     return number.low <= 0 <= number.high
-
-
-def _make_limit_from_interval(
-    number: FittedValue, file_value: ModelFileValue | None
-) -> DetectionLimit:
-    """Return the detection limit of a fitted number: the larger end of its 95 % interval.
-
-    Args:
-        number: the number, with its interval.
-        file_value: its value in the model file, by which the limit is scaled; None if the file has
-            none.
-    """
-    low, high = number.low or 0.0, number.high or 0.0
-    size = max(abs(low), abs(high))
-    return DetectionLimit(size if file_value is None else file_value.compute_half_width(size))
 
 
 FORMAT_VERSION = 1

@@ -18,21 +18,19 @@ from bench.diagnosis.datasheet.datasheet_content import (
     format_short_name,
     title,
 )
-from bench.diagnosis.datasheet.drive_diagram import DriveDiagram
-from bench.diagnosis.report.effect_and_unit_text import (
+from bench.diagnosis.datasheet.drive_diagram import DriveDiagram, draw_diagram
+from bench.diagnosis.report.cause_and_value_text import (
     append_unit,
     format_fitted_value,
     format_number,
     format_sentence,
-    format_unit,
     sanitise,
 )
-from bench.figures import figure_output, style
+from bench.figures import figure_layout, figure_output, style
 from bench.figures.figure_settings import is_pdf_wanted
 from bench.figures.label_text import POINTS, measure_text_width
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -77,70 +75,16 @@ _FOOT_HEIGHT = 0.045
 
 def render_diagram(diagram: DriveDiagram) -> figure_output.FigureFiles:
     """Render the diagram as SVG for the page, and as PDF if requested."""
-    with style.apply_settings(STYLE):
-        figure, axes = style.make_panel_grid(1, 1, (5.4, 4.6))
+    with figure_layout.apply_settings(STYLE):
+        figure, axes = figure_layout.make_panel_grid(1, 1, (5.4, 4.6))
         draw_diagram(axes[0, 0], diagram)
         pdf = figure_output.render_pdf(figure) if is_pdf_wanted() else None
         return figure_output.FigureFiles(b"", figure_output.render_svg(figure), pdf)
 
 
-def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
-    """Draw the diagram: where the joint moves, holds and slips, by load and motor force.
-
-    The region above the forward boundary is forward motion, below the backward boundary back
-    motion; in between the joint holds. The dotted diagonal is the force that balances the load.
-    Marks show the break-away force and the load that moves the joint back.
-
-    Args:
-        axes: Axes to draw on.
-        diagram: Diagram to draw.
-    """
-    load_range, unit = diagram.axis_limit, format_unit(diagram.unit)
-    load = diagram.load
-    # Infinite boundaries are drawn beyond the axes.
-    beyond_axes = 2 * load_range
-    forward, backward = (
-        np.clip(boundary, -beyond_axes, beyond_axes) for boundary in (diagram.forward, diagram.back)
-    )
-    axes.fill_between(load, forward, beyond_axes, color=style.PALE_BLUE, linewidth=0)
-    axes.fill_between(load, backward, forward, color=style.HELD_OUT_GREY, linewidth=0)
-    axes.fill_between(load, -beyond_axes, backward, color=style.PALE_RUST, linewidth=0)
-    axes.plot(load, forward, color=style.BLUE, linewidth=1.5)
-    axes.plot(load, backward, color=style.VERMILION, linewidth=1.5, linestyle=(0, (5, 2)))
-    axes.plot(load, load, color=style.CONNECTOR_GREY, linewidth=0.8, linestyle=":")
-    axes.axhline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
-    axes.axvline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
-    for force, position, marker in (
-        (diagram.breakaway, (0.0, diagram.breakaway), "o"),
-        (diagram.backdrive, (diagram.backdrive, 0.0), "s"),
-    ):
-        if 0 < force <= load_range:
-            axes.plot(
-                *position, marker=marker, color=style.NEUTRAL_MARK, markersize=5, linestyle="none"
-            )
-            text = f" {format_number(force)} {unit}"
-            axes.annotate(text, position, xytext=(4, 4), textcoords="offset points")
-    text_style: dict[str, Any] = {"ha": "center", "va": "center", "color": style.CAPTION_GREY}
-    # Places of the labels in the regions of the diagram, as shares of the range of its axes.
-    axes.text(-0.55 * load_range, 0.75 * load_range, "moves forward", **text_style)
-    axes.text(0.55 * load_range, -0.75 * load_range, "moves back", **text_style)
-    axes.text(0.72 * load_range, 0.25 * load_range, "back-driven:\nthe load slips", **text_style)
-    # The region in which the joint holds is labelled where it is wide enough.
-    middle = 0.62 * load_range
-    if np.interp(middle, load, forward - backward) > 0.15 * load_range:
-        axes.text(middle, middle, "holds", **text_style)
-    axes.set(
-        xlim=(-load_range, load_range),
-        ylim=(-load_range, load_range),
-        xlabel=f"load [{unit}]",
-        ylabel=f"force of the motor [{unit}]",
-    )
-    axes.set_title("Drive and back-drive, at rest", fontsize=9, loc="left")
-
-
 def render_pdf(content: SheetContent) -> bytes:
     """Render the sheet as a PDF of one page."""
-    with style.apply_settings(STYLE):
+    with figure_layout.apply_settings(STYLE):
         return figure_output.render_pdf(draw_sheet(content))
 
 

@@ -21,20 +21,24 @@ which it changes the runs by at least the smallest detectable amount (`diagnosis
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from bench.core.random_streams import make_rng
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
+from bench.diagnosis.datasheet.datasheet_joint import ModelFileValue, SheetSubject
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import ModelSet
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
-from bench.diagnosis.fitting.levenberg_marquardt_step import compute_schur_complement
+from bench.diagnosis.fitting.levenberg_marquardt import (
+    FitStart,
+    TrajectoryFit,
+    compute_schur_complement,
+)
+from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.identifiability import CONFOUNDING_CORRELATION, MIN_DETECTABLE_LIMIT_SIGMAS
 from bench.diagnosis.score_extended import build_theta
@@ -52,9 +56,13 @@ from bench.diagnosis.validation.confidence_intervals import (
     invert_scaled,
 )
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
-from bench.diagnosis.validation.run_consistency import ParameterConsistency, assess_consistency
+from bench.diagnosis.validation.run_consistency import (
+    assess_consistency,
+    compute_prediction_half_widths,
+)
+from sims.core.effect import ALL_PLACES
 from sims.core.simulator import Array, InputError
-from sims.extended_simulator import ExtendedSimulator
+from sims.extended_simulator import ExtendedSimulator, FittedValue
 
 SAME_COEFFICIENT_CORRELATION = 0.999
 """Minimum correlation for which the coefficient of an effect counts as equivalent to that of a
@@ -175,30 +183,8 @@ def compute_detection_limits(
         models.compute_residual(fit),
     )
     return calculator.compute_limits(
-        _compute_prediction_half_widths(assess_consistency(models, model))
+        compute_prediction_half_widths(assess_consistency(models, model))
     )
-
-
-def _compute_prediction_half_widths(
-    consistencies: Sequence[ParameterConsistency],
-) -> dict[str, float]:
-    """Return half the prediction interval of each parameter for a new log, or else a new run.
-
-    Prediction intervals have the variation between logs (or runs) in them, in addition to the error
-    of the joint fit.
-
-    Args:
-        consistencies: Consistency of each parameter between runs, and between logs if there are
-            several.
-    """
-    # A new log is more general than a new run, so that it comes later and replaces it. Groups by a
-    # constant, such as a load, are not used.
-    return {
-        consistency.number: Z95 * consistency.prediction_sigma
-        for grouping in ("run", "log")
-        for consistency in consistencies
-        if consistency.by == grouping
-    }
 
 
 def _add_small_gaps(
@@ -512,3 +498,49 @@ class _DetectionLimitCalculator:
         if information[smallest] > information[largest]:
             return DetectionLimit(max(detectable_sizes, default=np.inf), limit="below")
         return DetectionLimit(min(detectable_sizes, default=np.inf), limit="above")
+
+
+def make_limit_from_interval(
+    number: FittedValue, file_value: ModelFileValue | None
+) -> DetectionLimit:
+    """Return the detection limit of a fitted number: the larger end of its 95 % interval.
+
+    Args:
+        number: the number, with its interval.
+        file_value: its value in the model file, by which the limit is scaled; None if the file has
+            none.
+    """
+    low, high = number.low or 0.0, number.high or 0.0
+    size = max(abs(low), abs(high))
+    return DetectionLimit(size if file_value is None else file_value.compute_half_width(size))
+
+
+def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> Iterator[str]:
+    """Yield the names of effects that can act at the subject but are not in the model.
+
+    Simpler forms of the effects in the model are left out: a model with Stribeck friction does not
+    lack Coulomb friction. So are effects at all places of a kind at once (families). An effect
+    whose coefficients are all zero counts as absent.
+
+    Args:
+        subject: Joint or system of the sheet.
+        extended: Extended simulator.
+    """
+    local_effects = [
+        effect
+        for name, coefficients in extended.effects.items()
+        for effect, _, fitted_value in subject.localise_effect(name, coefficients)
+        if fitted_value.value != 0
+    ]
+    modelled = {*local_effects, *extended.effects}
+    effect_classes = {effect.name: effect for effect in subject.list_effects()}
+    # An effect names in `contains` the simpler ones to which it reduces if some of its coefficients
+    # are zero.
+    simpler_effects = {
+        contained_effect
+        for name in local_effects
+        for contained_effect in getattr(effect_classes.get(name), "contains", ())
+    }
+    for name in effect_classes:
+        if name not in modelled | simpler_effects and name.partition("@")[2] != ALL_PLACES:
+            yield name

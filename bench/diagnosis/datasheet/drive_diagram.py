@@ -15,16 +15,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from bench.diagnosis.datasheet.datasheet_subject import SheetSubject
+from bench.diagnosis.datasheet.datasheet_joint import SheetSubject
+from bench.diagnosis.report.cause_and_value_text import format_number, format_unit
+from bench.figures import style
 from sims import effects as library
 from sims.core.effect import Effect, Force, Friction, HiddenStateEffect
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot, System, SystemKind
 from sims.extended_simulator import ExtendedSimulator
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 LOAD_POINT_COUNT = 201
 """Number of loads on the diagram."""
@@ -279,3 +284,57 @@ def _expand_coefficients(c: Array, drive: Array) -> Array:
         drive: (N,) forces of the drive, of which only the number counts.
     """
     return np.broadcast_to(c, (len(c), len(drive), 1))
+
+
+def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
+    """Draw the diagram: where the joint moves, holds and slips, by load and motor force.
+
+    The region above the forward boundary is forward motion, below the backward boundary back
+    motion; in between the joint holds. The dotted diagonal is the force that balances the load.
+    Marks show the break-away force and the load that moves the joint back.
+
+    Args:
+        axes: Axes to draw on.
+        diagram: Diagram to draw.
+    """
+    load_range, unit = diagram.axis_limit, format_unit(diagram.unit)
+    load = diagram.load
+    # Infinite boundaries are drawn beyond the axes.
+    beyond_axes = 2 * load_range
+    forward, backward = (
+        np.clip(boundary, -beyond_axes, beyond_axes) for boundary in (diagram.forward, diagram.back)
+    )
+    axes.fill_between(load, forward, beyond_axes, color=style.PALE_BLUE, linewidth=0)
+    axes.fill_between(load, backward, forward, color=style.HELD_OUT_GREY, linewidth=0)
+    axes.fill_between(load, -beyond_axes, backward, color=style.PALE_RUST, linewidth=0)
+    axes.plot(load, forward, color=style.BLUE, linewidth=1.5)
+    axes.plot(load, backward, color=style.VERMILION, linewidth=1.5, linestyle=(0, (5, 2)))
+    axes.plot(load, load, color=style.CONNECTOR_GREY, linewidth=0.8, linestyle=":")
+    axes.axhline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
+    axes.axvline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
+    for force, position, marker in (
+        (diagram.breakaway, (0.0, diagram.breakaway), "o"),
+        (diagram.backdrive, (diagram.backdrive, 0.0), "s"),
+    ):
+        if 0 < force <= load_range:
+            axes.plot(
+                *position, marker=marker, color=style.NEUTRAL_MARK, markersize=5, linestyle="none"
+            )
+            text = f" {format_number(force)} {unit}"
+            axes.annotate(text, position, xytext=(4, 4), textcoords="offset points")
+    text_style: dict[str, Any] = {"ha": "center", "va": "center", "color": style.CAPTION_GREY}
+    # Places of the labels in the regions of the diagram, as shares of the range of its axes.
+    axes.text(-0.55 * load_range, 0.75 * load_range, "moves forward", **text_style)
+    axes.text(0.55 * load_range, -0.75 * load_range, "moves back", **text_style)
+    axes.text(0.72 * load_range, 0.25 * load_range, "back-driven:\nthe load slips", **text_style)
+    # The region in which the joint holds is labelled where it is wide enough.
+    middle = 0.62 * load_range
+    if np.interp(middle, load, forward - backward) > 0.15 * load_range:
+        axes.text(middle, middle, "holds", **text_style)
+    axes.set(
+        xlim=(-load_range, load_range),
+        ylim=(-load_range, load_range),
+        xlabel=f"load [{unit}]",
+        ylabel=f"force of the motor [{unit}]",
+    )
+    axes.set_title("Drive and back-drive, at rest", fontsize=9, loc="left")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.logs.quality.noise_estimation import estimate_differences_sigma, estimate_noise
+from sims.core.noise_estimation import estimate_differences_sigma, estimate_noise
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 

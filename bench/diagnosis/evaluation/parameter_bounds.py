@@ -1,6 +1,6 @@
 """Ranges of parameters and effect coefficients: plausible values, and the bounds of a fit.
 
-Times and frequencies follow the time scale of the recording (`evaluation.plausible_ranges`).
+Times and frequencies follow the time scale of the recording (`evaluation.time_scaled_ranges`).
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from bench.diagnosis.evaluation.plausible_ranges import is_instant
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.time_scaled_ranges import is_instant
 from sims.core.effect import Coefficient, Effect, Friction
 from sims.core.simulator import Array, Parameter
 from sims.effects.friction import VISCOUS_UNITS

@@ -12,11 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
+from bench.diagnosis.evaluation.initial_state_guesses import (
+    RunData,
+    prepare_run,
+    take_first_samples,
+)
 from bench.diagnosis.evaluation.noise_model import Mask
-from bench.diagnosis.evaluation.plausible_ranges import adapt_to_time_scale
-from bench.diagnosis.evaluation.run_data import RunData, prepare_run, take_first_samples
 from bench.diagnosis.evaluation.search_control import SearchControl
 from bench.diagnosis.evaluation.simulation_cache import SimulationCache
+from bench.diagnosis.evaluation.time_scaled_ranges import adapt_to_time_scale
 from sims import effects as library
 from sims.core.effect import Effect, Input, Sensor, members_of
 from sims.core.simulator import Array, InputError, Parameter, Scenario, make_unknown_name_error
@@ -108,7 +112,7 @@ class RunEvaluator:
         state_derivatives: (R, T, C, s) derivatives by the initial states if they come from a
             linearisation, else None.
         cached_linearisations: linearised robot runs that were used most recently
-            (`bench.diagnosis.fitting.linearised_runs`).
+            (`bench.diagnosis.fitting.trajectory_derivatives`).
         cached_responses: responses to effects that have no linearisation, by name and coefficients.
         filtered_runs: the runs of a robot as followed by a state filter, or None
             (`bench.diagnosis.kalman.linearised_filter`).
@@ -118,7 +122,7 @@ class RunEvaluator:
         is_in_contact: whether geoms of a robot touch, so that initial states were estimated by a
             nonlinear filter.
         measured_states: for runs of a robot, states estimated from readings alone
-            (`bench.diagnosis.kalman.measured_states`).
+            (`bench.diagnosis.kalman.kinematic_smoother`).
         worker_pool: worker pool for simulations and fits; by default only this process.
 
     Raises:

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, runtime_checkable
 
-from sims.core.document_fields import Document
+from sims.core.json_documents import Document
 
 
 @runtime_checkable

@@ -27,7 +27,7 @@ from bench.diagnosis.experiment_design.candidate_runs import (
 )
 from bench.diagnosis.experiment_design.safety_limits import RigLimits
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
-from sims.core.document_fields import OPTIONAL, Document
+from sims.core.json_documents import OPTIONAL, Document
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
 

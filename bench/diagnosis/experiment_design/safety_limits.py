@@ -20,7 +20,6 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.experiment_design.candidate_runs import CandidateRun
 from bench.diagnosis.experiment_design.model_file_limits import Interval, read_model_file_limits
 from bench.diagnosis.fitting.fitted_models import FittedModel
-from bench.logs.quality.pose_check import find_contacts
 from sims.core.simulator import Array, Scenario
 
 TRAVEL_FACTOR = 3.0
@@ -224,15 +223,24 @@ class RigLimits:
                 return False
         return (
             not self.evaluator.kind.has_model
-            or find_contacts(self.evaluator.kind, channels) <= self._touching_pairs
+            or self._find_contacts(channels) <= self._touching_pairs
         )
 
     @cached_property
     def _touching_pairs(self) -> frozenset[tuple[int, int]]:
         """Pairs of bodies that touched in the present runs."""
-        return frozenset().union(
-            *(find_contacts(self.evaluator.kind, run) for run in self.present_runs)
-        )
+        return frozenset().union(*(self._find_contacts(run) for run in self.present_runs))
+
+    def _find_contacts(self, channels: Mapping[str, Array]) -> frozenset[tuple[int, int]]:
+        """Return the pairs of bodies of the robot that touch in a motion.
+
+        Args:
+            channels: joint positions of the motion, by channel.
+        """
+        # This import is needed for robots only.
+        from sims.robot.contact_pairs import find_contacts
+
+        return find_contacts(self.evaluator.kind, channels)
 
 
 def _widen_by_stop(stated_range: Interval, present_range: Interval, is_position: bool) -> Interval:

@@ -29,7 +29,7 @@ from bench.diagnosis.evaluation.parameter_bounds import (
     widen_range,
 )
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from sims.core.simulator import Array, Parameter
 
@@ -174,7 +174,7 @@ def fit_base_model(
     # filter, they were computed about the first start, far from the fitted model.
     if evaluator.has_linearisation and evaluator.filtered_runs is None:
         # The import is local, because only robots need it.
-        from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+        from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
 
         compute_state_jacobian(evaluator, best.theta, best.initial_states, is_recomputed=True)
         best = BaseFit(best, frozenset()).refit(evaluator, noise).fit

@@ -22,10 +22,10 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.noise_model import Likelihood, Mask, NoiseModel, maximise_likelihood
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter, compute_state_prior
-from sims.core.plain_values import join_first_names
 from sims.core.simulator import Array
+from sims.core.user_messages import join_first_names
 
 EffectNames = tuple[str, ...]
 

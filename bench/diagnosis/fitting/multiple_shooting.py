@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
 from sims.core.simulator import Array
 from sims.recording.recording import Run
 

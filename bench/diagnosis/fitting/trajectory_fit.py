@@ -1,7 +1,7 @@
 """Least-squares fit of trajectories with shared parameters and initial states of each run.
 
 Levenberg-Marquardt for many models at once, so that one engine call serves all of them. A single
-step of one model is in `levenberg_marquardt_step`. AR(1) noise is whitened first (`noise_model`),
+step of one model is in `levenberg_marquardt`. AR(1) noise is whitened first (`noise_model`),
 so the fit is a generalised least-squares fit. Parallel fits share their best cost between rounds,
 and those that fall far behind are stopped.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, whiten
 from bench.diagnosis.evaluation.parameter_bounds import Bounds, get_bounds_by_index
 from bench.diagnosis.evaluation.run_evaluator import MIN_CHUNK_SIZE, Indices, RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt_state import (
+from bench.diagnosis.fitting.levenberg_marquardt import (
     INITIAL_DAMPING,
     INITIAL_DAMPING_GROWTH,
     MAX_DAMPING,
@@ -25,13 +25,14 @@ from bench.diagnosis.fitting.levenberg_marquardt_state import (
     FitStart,
     FitState,
     TrajectoryFit,
+    combine_runs,
+    compute_gauss_newton_step,
 )
-from bench.diagnosis.fitting.levenberg_marquardt_step import (
+from bench.diagnosis.fitting.trajectory_derivatives import (
     INITIAL_PARAMETER_STEP,
     INITIAL_STATE_STEP,
     build_displaced_inputs,
     compute_difference_steps,
-    compute_gauss_newton_step,
     is_finite_response,
 )
 from sims.core.effect import is_dry_friction
@@ -404,7 +405,7 @@ class TrajectoryFitter:
             fit_state.jacobian_renewals += 1
             if fit_state.needs_own_state_jacobian:
                 # Imported here, because only robots need it.
-                from bench.diagnosis.fitting.linearised_runs import (
+                from bench.diagnosis.fitting.trajectory_derivatives import (
                     compute_initial_state_derivatives,
                 )
 
@@ -591,7 +592,7 @@ class TrajectoryFitter:
         """
         evaluator = self.evaluator
         # Imported here, because only robots need it.
-        from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+        from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
 
         state_jacobian = fit_state.own_state_jacobian
         if state_jacobian is None:
@@ -657,7 +658,7 @@ class TrajectoryFitter:
 
         For run i it is d_i = (z_i - g_i) / pi, with the initial state z_i and the mean g_i and
         standard deviation pi of its prior. The squares are a term of the cost, eq. (1) of
-        `levenberg_marquardt_step`.
+        `levenberg_marquardt`.
 
         Shapes: R runs, s states of a run.
         """
@@ -678,7 +679,7 @@ class TrajectoryFitter:
     def _compute_cost(self, simulated: Array, states: Array, sample_mask: Mask) -> float:
         """Return the sum of squares of the whitened residual and of the state deviations.
 
-        This is the cost, eq. (1) of `levenberg_marquardt_step`: sum_i |r_i|^2 + sum_i |d_i|^2, with
+        This is the cost, eq. (1) of `levenberg_marquardt`: sum_i |r_i|^2 + sum_i |d_i|^2, with
         the whitened residual r_i of run i and the deviation d_i of its initial state from the prior
         mean, in standard deviations. It is infinite if a simulation was abandoned.
 
@@ -871,7 +872,7 @@ class TrajectoryFitter:
         is_moved = costs < last_costs
         with np.errstate(all="ignore"):
             fit_state.adapt_state_damping(last_squares - squares, is_moved)
-        combined = _combine_runs(last, trial, is_moved, np.minimum(costs, last_costs))
+        combined = combine_runs(last, trial, is_moved, np.minimum(costs, last_costs))
         return combined, bool((costs > last_costs).any())
 
 
@@ -895,26 +896,6 @@ def _find_channels_of_states(evaluator: RunEvaluator) -> Mask:
     shows: Mask = (joints_of_channels[:, None] == joints_of_states) & is_of_joint[:, None]
     # A state that no channel shows gets all channels.
     return shows | ~shows.any(axis=0)
-
-
-def _combine_runs(last: FitPoint, trial: FitPoint, is_moved: Mask, costs: Array) -> FitPoint:
-    """Return the trial point in some runs, and the last point in the others.
-
-    Both points have the same parameters, so that no run influences another one.
-
-    Args:
-        last: the point before the step.
-        trial: the point after the step.
-        is_moved: (R,) mask of those of the R runs that have the trial point.
-        costs: (R,) costs of the combined runs.
-    """
-    states = np.where(is_moved[:, None], trial.start.initial_states, last.start.initial_states)
-    return replace(
-        trial,
-        start=replace(trial.start, initial_states=states),
-        simulated=np.where(is_moved[:, None, None], trial.simulated, last.simulated),
-        cost=float(costs.sum()),
-    )
 
 
 def _can_stick(evaluator: RunEvaluator, names: Sequence[str]) -> bool:

@@ -1,6 +1,6 @@
 """Responses of the innovations to every candidate effect, carried through the filter's recursion.
 
-With gain K and whitener W of the filter (`bench.diagnosis.kalman.filter_and_smoother`), a unit of
+With gain K and whitener W of the filter (`bench.diagnosis.kalman.kalman_recursions`), a unit of
 candidate k, which adds b to states and ψ to readings (`dynamics.linearisation_about_recording`,
 eqs. (3) and (4)), changes the predicted state by s and the whitened innovations by -w:
 
@@ -23,8 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
-from bench.diagnosis.kalman.filter_and_smoother import (
+from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
+from bench.diagnosis.kalman.kalman_recursions import (
     MAX_MAGNITUDE,
     IndexArray,
     add_noise_states,

@@ -24,18 +24,18 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.kalman.measured_states import estimate_measured_states
+from bench.diagnosis.kalman.kinematic_smoother import estimate_measured_states
 from sims.core.simulator import Array
 from sims.robot.dynamics.active_effects import (
     is_evaluated_per_step,
     pad_coefficients,
-    select_model_field_effects,
     slice_active_effects,
 )
 from sims.robot.dynamics.added_elements import group_by_added_elements
 from sims.robot.dynamics.joint_scales import compute_joint_scales
 from sims.robot.dynamics.run_batches import RobotRunBatch
 from sims.robot.floating_joints import FloatingState
+from sims.robot.model_field_effects import select_model_field_effects
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_simulator import LINEARISATION_BATCH_SIZE, RobotSimulator
 

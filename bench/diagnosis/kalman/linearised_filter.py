@@ -14,9 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.initial_state_guesses import estimate_resting_position
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.kalman.filter_and_smoother import (
+from bench.diagnosis.kalman.kalman_recursions import (
     MAX_MAGNITUDE,
     SMALLEST_FORCE,
     Filtered,
@@ -27,10 +28,7 @@ from bench.diagnosis.kalman.filter_and_smoother import (
     filter_runs,
     fit_process_noise,
 )
-from bench.diagnosis.kalman.measured_states import (
-    estimate_measured_states,
-    estimate_resting_position,
-)
+from bench.diagnosis.kalman.kinematic_smoother import estimate_measured_states
 from bench.diagnosis.kalman.settled_first_states import (
     FirstState,
     FirstStateFitter,

@@ -1,7 +1,7 @@
 """Joint forces of a robot by inverse dynamics at its recorded motion, without simulation.
 
-The motion is estimated from the readings (`measured_states`). Comparing the force that it requires
-with the force of the model's drive shows whether the drive was active.
+The motion is estimated from the readings (`kinematic_smoother`). Comparing the force that it
+requires with the force of the model's drive shows whether the drive was active.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.kalman.measured_states import JointReadings, track_joints
-from bench.logs.quality.noise_estimation import estimate_noise
+from bench.diagnosis.kalman.kinematic_smoother import JointReadings, track_joints
+from sims.core.noise_estimation import estimate_noise
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 from sims.robot.dynamics.activation_filters import activation_filters

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, smooth_runs
+from bench.diagnosis.kalman.kalman_recursions import LinearRuns, filter_runs, smooth_runs
 from sims.effects.compiled_recursions import LINEAR, run_recursion
 
 

@@ -2,7 +2,8 @@
 
 A robot on the ground stands or drives, and its pose is recorded. The noise of the pose makes
 contacts too deep or opens them, so that a simulation from a measured state begins with a jump. A
-first state is settled if its contacts are in equilibrium (`sims.robot.dynamics.contact_states`).
+first state is settled if its contacts are in equilibrium (`contact_equilibrium` of the robot's
+dynamics).
 
 Shapes: R runs of T samples, C channels, and D coordinates; a state has D positions and D
 velocities.
@@ -19,10 +20,10 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.kalman.filter_and_smoother import Mask
-from bench.diagnosis.kalman.measured_states import estimate_measured_states
+from bench.diagnosis.kalman.kalman_recursions import Mask
+from bench.diagnosis.kalman.kinematic_smoother import estimate_measured_states
 from sims.core.simulator import Array
-from sims.robot.dynamics.contact_states import ContactModel, KnownJacobians, settle_contacts
+from sims.robot.dynamics.contact_equilibrium import ContactModel, KnownJacobians, settle_contacts
 from sims.robot.robot_simulator import RobotSimulator
 
 MEASURED_PRIOR = 10.0

@@ -16,7 +16,7 @@ from bench.diagnosis.fitting.base_fit import (
 from bench.diagnosis.identifiability import freeze_unidentified_parameters
 from bench.diagnosis.pipeline.run_filtering import filter_simulated_runs
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
-from bench.diagnosis.validation.held_out_runs import find_first_states
+from bench.diagnosis.search.fit_starts import find_first_states
 from sims.core.simulator import Array
 from sims.recording.recorded_poses import ANGLES
 

@@ -7,13 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.diagnosis.dry_friction_form import has_dry_friction, make_soft_kind
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.friction_form_verdict import (
-    has_dry_friction,
-    make_soft_kind,
-    refit_if_likelier_soft,
-)
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.pipeline.base_model import BaseModel
 from bench.diagnosis.pipeline.convention_and_unit_checks import RecordingErrorCheck
 from bench.diagnosis.pipeline.search_result import SearchResult
@@ -120,6 +116,9 @@ class CauseSearch:
         )
         if not is_comparison_needed:
             return result
+        # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.dry_friction_fits import refit_if_likelier_soft
+
         soft_model = refit_if_likelier_soft(
             search, result.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
         )

@@ -9,10 +9,10 @@ from typing import Any, cast
 
 import numpy as np
 
+from bench.diagnosis.dry_friction_form import add_solver_parameters, get_friction_form
 from bench.diagnosis.evaluation.parameter_bounds import bound_of, get_bounds_by_index, is_unusual
-from bench.diagnosis.evaluation.plausible_ranges import is_instant
+from bench.diagnosis.evaluation.time_scaled_ranges import is_instant
 from bench.diagnosis.fitting.fitted_models import FittedModel
-from bench.diagnosis.friction_form_verdict import add_solver_parameters, get_friction_form
 from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.validation.confidence_intervals import compute_intervals

@@ -11,7 +11,7 @@ import numpy as np
 from bench.core.resource_estimates import check_recording_size
 from bench.diagnosis.evaluation.noise_floor import INTEGRATION_ERROR_SHARE, add_minimal_noise
 from bench.diagnosis.pipeline.contact_conditions import ContactConditions
-from bench.diagnosis.pipeline.left_out_segments import leave_out_unpredictable_segments
+from bench.diagnosis.pipeline.segment_choice import leave_out_unpredictable_segments
 from bench.diagnosis.pipeline.simulated_runs import (
     DiagnosisContext,
     SimulatedRuns,
@@ -121,7 +121,7 @@ def _add_contact_effects(
     if not kind.has_model:
         return kind
     # These imports are needed for robots only.
-    from bench.logs.quality.pose_check import find_recorded_contacts
+    from sims.robot.contact_pairs import find_recorded_contacts
     from sims.robot.robot_simulator import RobotSimulator
 
     assert issubclass(kind, RobotSimulator)

@@ -6,14 +6,16 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bench.diagnosis import residual_analysis
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import select_likeliest
-from bench.diagnosis.identifiability import ParameterIdentifiability, assess_identifiability
-from bench.diagnosis.pipeline.held_out_gains import HeldOutGains
+from bench.diagnosis.identifiability import (
+    assess_identifiability_after_search,
+)
+from bench.diagnosis.pipeline.held_out_gap_closed import HeldOutGains
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
-from bench.diagnosis.report.cause_text import format_effect_set
-from bench.diagnosis.report.effect_and_unit_text import END, format_file_change
+from bench.diagnosis.report import residual_analysis
+from bench.diagnosis.report.cause_and_value_text import END, format_effect_set, format_file_change
 from bench.diagnosis.report.report_data import (
     ChannelInfo,
     DataSplit,
@@ -73,7 +75,7 @@ def build_report_data(
         path=recording.path,
         verdict=verdict,
         channels=_list_channels(result.runs, sigma),
-        fitting=residual_analysis.build_data_split(evaluator, before, after),
+        fitting=build_data_split(evaluator, before, after),
         held_out=held_out,
         gap_locations=(
             *residual_analysis.compute_gap_locations(evaluator, before, after, sigma),
@@ -87,7 +89,7 @@ def build_report_data(
         why=reasons,
         unidentified_parameters=finding.unidentified_parameters,
         robot=residual_analysis.get_robot(evaluator),
-        identifiability=_assess_identifiability(result.search),
+        identifiability=assess_identifiability_after_search(result.search),
         consistency=consistency,
         track=_read_track_figure(recording),
         logs=max(1, len({run.log for run in recording.runs})),
@@ -168,29 +170,6 @@ def _estimate_parameters_by_group(
     )
 
 
-def _assess_identifiability(search: EffectSearch) -> tuple[ParameterIdentifiability, ...]:
-    """Assess identifiability from the responses of the runs to effects (directions).
-
-    The search has computed them about the base model, on their own or together with scores. If it
-    has not, the result is empty. This is the last step that uses the search, so its memory is
-    released first.
-
-    Args:
-        search: the finished search.
-    """
-    search.release_memory()
-    directions = search.get_known_directions()
-    if directions is None:
-        # Scans are scores with their directions, by the effects of the model; the base model has no
-        # effects. That of an earlier fit is used if a better fit has replaced it without a scan.
-        key: frozenset[str] = frozenset()
-        scan = search.cached_scans.get(key) or search.superseded_scans.get(key)
-        if scan is None:
-            return ()
-        directions = scan.fit, scan.directions
-    return assess_identifiability(search.evaluator, search.noise, *directions)
-
-
 def _summarise_held_out(
     result: SearchResult, sigma: Array
 ) -> tuple[DataSplit | None, list[GapLocation]]:
@@ -216,7 +195,7 @@ def _summarise_held_out(
     )
     # Channels and phases are reported for the fitted runs only; held-out gaps by run.
     runs = [location for location in locations if location.kind == "run"]
-    return residual_analysis.build_data_split(evaluator, before, after), runs
+    return build_data_split(evaluator, before, after), runs
 
 
 def _list_channels(runs: SimulatedRuns, sigma: Array) -> tuple[ChannelInfo, ...]:
@@ -370,3 +349,18 @@ def _get_value_and_interval(number: Estimate) -> tuple[float, float, float]:
     low = np.nan if number.low is None else number.low
     high = np.nan if number.high is None else number.high
     return number.value, low, high
+
+
+def build_data_split(evaluator: RunEvaluator, before: Array, after: Array) -> DataSplit:
+    """Return the runs of a run evaluator with two simulations of them.
+
+    Shapes: R runs, T samples, C channels.
+
+    Args:
+        evaluator: Run evaluator of the runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended model.
+    """
+    names = tuple(run_data.name for run_data in evaluator.prepared_runs)
+    times = tuple(run_data.scenario.times for run_data in evaluator.prepared_runs)
+    return DataSplit(names, times, evaluator.observed, before, after)

@@ -67,8 +67,8 @@ def _filter_with_fitted_parameters(runs: SimulatedRuns) -> FollowedRuns:
         runs: the runs of a robot with free numbers of its model file.
     """
     # These imports are needed for robots only.
-    from bench.diagnosis.prediction_error.base_identification import identify_base
-    from bench.diagnosis.prediction_error.identification_without_simulation import is_long
+    from bench.diagnosis.prediction_error.base_parameter_identification import identify_base
+    from bench.diagnosis.prediction_error.stepwise_selection_by_filters import is_long
 
     evaluator = runs.fitting
     with runs.record_widened_ranges():

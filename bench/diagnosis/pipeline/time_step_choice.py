@@ -9,7 +9,7 @@ from itertools import combinations, tee
 from typing import TYPE_CHECKING, Any
 
 from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS, select_likeliest
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.numerics_cause import CoarseStepFinding
 from bench.diagnosis.pipeline.base_model import BaseModel

@@ -11,7 +11,7 @@ from bench.diagnosis.experiment_design.discriminating_run import (
     DiscriminatingRun,
     propose_discriminating_run,
 )
-from bench.diagnosis.pipeline.held_out_gains import HeldOutGains
+from bench.diagnosis.pipeline.held_out_gap_closed import HeldOutGains
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.search import verdict_rules
 from bench.diagnosis.search.diagnose import DiagnosisResult

@@ -5,49 +5,49 @@ Each effect of the best set is replaced in turn by another one, or moved to anot
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS, FittedModel, select_likeliest
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.effects_at_joints import (
-    JOINT_MODEL,
-    SERVO_MODEL,
     has_series,
     is_time_shift,
-    list_at_coupled_joints,
     list_joint_model_effects,
-    list_similar_dampings,
-    list_similar_inertias,
-    list_similar_shifts,
 )
 from bench.diagnosis.prediction_error.filters_with_effects import (
     COMPETING_MODEL_MARGIN,
     GAUSS_NEWTON_STEPS,
     compute_comparison_margin,
 )
-from bench.diagnosis.prediction_error.forward_selection_by_filters import try_one_more_effect
-from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
+from bench.diagnosis.prediction_error.physically_equivalent_effects import (
+    list_at_coupled_joints,
+    list_moved_payloads,
+    list_similar_dampings,
+    list_similar_inertias,
+    list_similar_shifts,
+)
 from bench.diagnosis.prediction_error.simulated_fits import (
     MAX_IMPROVED_SIZE,
     MAX_SINGLE_SQUARES_SHARE,
     fit_filtered,
     is_explained,
     is_nearly_explained,
-    make_replacing_start,
     remove_idle_effects,
     select_lowest_of_each,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
-    refine_single_effects,
+    refine_at_force_limits,
     scale_effect,
 )
+from bench.diagnosis.prediction_error.stepwise_selection_by_filters import try_one_more_effect
 from bench.diagnosis.search.alternative_causes import differ_in_one_effect
+from bench.diagnosis.search.fit_starts import make_replacing_start
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.simulator import Array
 
@@ -59,11 +59,6 @@ MAX_RICHER_LAWS = 3
 """Maximum number of richer laws that are fitted in place of a law."""
 COMPETING_FACTORS = (0.5, 0.8, 1.0, 1.25, 2.0)
 """Factors of the regression coefficient at which a competing effect is simulated."""
-MAX_REFINED_EXCESS_SHARE = 0.25
-"""Maximum excess residual of a competing fit that is refined, above that of the best model.
-
-It is a share of the excess residual of the base model.
-"""
 MAX_SINGLE_LOSS = 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 """Maximum loss of penalised log-likelihood by one effect in place of several."""
 MIN_SAME_JOINT_GAIN_SHARE = 0.5
@@ -270,7 +265,7 @@ def _find_better_competitor(context: SearchContext, best: FittedModel) -> Fitted
     size = len(best.effects)
     # Jumps of the state in the linear model come from drives at their force limits.
     if size == 1 and context.filters.base.runs.jumps.any():
-        _refine_at_force_limits(context, best, competing_effects)
+        refine_at_force_limits(context, best, competing_effects)
     _fit_at_related_places(context, size)
     _refine_near(context, size)
     preferred = search.get_best(size) or best
@@ -335,34 +330,6 @@ def _replace_two_effects(context: SearchContext, best: FittedModel) -> FittedMod
     fits = [context.search.fit_one(start) for start in starts]
     merged = select_likeliest(*fits, best)
     return None if merged is best else merged
-
-
-def _refine_at_force_limits(
-    context: SearchContext, best: FittedModel, competing_effects: Collection[str]
-) -> None:
-    """Fit single effects of the joint and servo models further, if they may reach the best model.
-
-    Fits at force limits may stop in local minima. A fit whose excess residual (RMS residual in
-    units of the noise, minus one) is far above that of the best model will hardly reach it, and is
-    not fitted further. The results are stored in `search.models`.
-
-    Args:
-        context: search, filters and regressions of the recording.
-        best: the best model, with a single effect.
-        competing_effects: names of the effects that compete with it.
-    """
-    search, laws = context.search, JOINT_MODEL + SERVO_MODEL
-    limit = search.compute_excess_residual(best) + MAX_REFINED_EXCESS_SHARE * (
-        search.compute_excess_residual(search.base_model)
-    )
-    fitted = [
-        search.models[frozenset([name])]
-        for name in competing_effects
-        if name.partition("@")[0] in laws and frozenset([name]) in search.models
-    ]
-    refine_single_effects(
-        context, [model for model in fitted if search.compute_excess_residual(model) < limit]
-    )
 
 
 def _find_competing_effects(

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.diagnosis.fitting.base_fit import compute_start_costs
-from bench.diagnosis.fitting.fitted_models import FittedModel
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.friction_form_verdict import (
+from bench.core.random_streams import make_rng
+from bench.diagnosis.dry_friction_form import (
     has_dry_friction,
+    has_soft_form,
     make_soft_kind,
-    refit_if_likelier_soft,
     replace_by_stateless_friction,
 )
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import compute_start_costs
+from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.prediction_error.effect_proposals import MIN_GAIN_SHARE, SearchContext
 from bench.diagnosis.prediction_error.effects_at_joints import get_joint_name
 from bench.diagnosis.prediction_error.filters_with_effects import (
@@ -399,3 +401,92 @@ def is_friction_sufficient(
     if soft_log_likelihood > max(stiff_log_likelihood, selected_log_likelihood) + margin:
         check_fit(context, friction)
     return True
+
+
+def refit_if_likelier_soft(
+    models: ModelSet, model: FittedModel, margin: float
+) -> FittedModel | None:
+    """Refit a robot model in MuJoCo's soft form of dry friction, and return it if it is likelier.
+
+    The dry friction may be an effect or a free number. A model without dry friction, or with soft
+    friction already, is not refitted.
+
+    Args:
+        models: Models with stiff friction, with their noise and frozen parameters.
+        model: One of these models, fitted.
+        margin: Minimum gain in twice the log-likelihood.
+
+    Returns:
+        The model with soft friction; None if stiff friction is kept.
+    """
+    if not has_dry_friction(models.evaluator, model.effects) or has_soft_form(models.evaluator):
+        return None
+    soft_evaluator = models.evaluator.with_kind(make_soft_kind(models.evaluator.kind))
+    try:
+        return choose_friction_form(models, model, soft_evaluator, margin)
+    finally:
+        soft_evaluator.close()
+
+
+def choose_friction_form(
+    models: ModelSet, model: FittedModel, other_evaluator: RunEvaluator, margin: float
+) -> FittedModel | None:
+    """Refit a model with the other form of dry friction, and return it if it is likelier.
+
+    The forms are stiff and soft: how hard the constraint of MuJoCo's `frictionloss` is solved.
+    Effects with a state that contain dry friction, such as hysteresis, do not act through
+    `frictionloss`. They are replaced by the dry friction that they contain, because they may only
+    imitate the other form.
+
+    Args:
+        models: Models of the present form, with their noise and frozen parameters.
+        model: One of these models, for which `has_dry_friction` is true.
+        other_evaluator: Run evaluator of the same runs and parameters, with a simulator of the
+            other form.
+        margin: Minimum gain in twice the log-likelihood. The sum of squares must be lower, too.
+
+    Returns:
+        The model in the other form; None if the present form is kept.
+    """
+    refitted_model = _refit_with_other_form(other_evaluator, models, model)
+    gain = refitted_model.likelihood.value - model.likelihood.value
+    # Of two models that leave much more than noise, the likelihood with autocorrelated noise may
+    # prefer the one with the larger residual, because it is smoother.
+    is_residual_smaller = refitted_model.fit.cost < model.fit.cost
+    return refitted_model if gain >= margin and is_residual_smaller else None
+
+
+def _refit_with_other_form(
+    evaluator: RunEvaluator, models: ModelSet, model: FittedModel
+) -> FittedModel:
+    """Fit the effects of a model with the other form of dry friction, stiff or soft.
+
+    Both forms can then be compared by their likelihoods. If the discretisation error of the
+    integrator was corrected for the model, it is corrected for the refit, too.
+
+    Args:
+        evaluator: the same runs, with a simulator of the other form.
+        models: models of the present form.
+        model: fitted model of these.
+    """
+    names, theta = replace_by_stateless_friction(models.evaluator, model.effects, model.fit.theta)
+    # The random numbers of these models do not affect the result.
+    other_models = ModelSet(
+        evaluator,
+        models.noise,
+        models.fixed_parameters,
+        make_rng("friction form"),
+        models.is_noise_stated,
+    )
+    refitted_model = other_models.fit_one(FitStart(names, theta, model.fit.initial_states))
+    if models.evaluator.discretisation_correction is None:
+        return refitted_model
+    # Both forms are compared without the discretisation error of the integrator.
+    from bench.diagnosis.evaluation.discretisation_error import correct_discretisation
+
+    correct_discretisation(
+        evaluator, models.noise, refitted_model.fit.theta, refitted_model.fit.initial_states
+    )
+    # Otherwise the fit without the correction, which is known, might be returned again.
+    other_models.models.clear()
+    return other_models.fit_one(refitted_model.fit.make_start())

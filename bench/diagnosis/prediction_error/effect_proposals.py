@@ -20,7 +20,7 @@ from bench.diagnosis.evaluation.parameter_bounds import (
 )
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.effects_at_joints import (
@@ -29,15 +29,17 @@ from bench.diagnosis.prediction_error.effects_at_joints import (
     SERVO_MODEL,
     SET_POINT_MODEL,
     get_joint_name,
-    get_servo_damping,
     get_servo_input,
     list_moved_bodies,
-    list_similar_shifts,
 )
 from bench.diagnosis.prediction_error.filters_with_effects import (
     OFFSET_THRESHOLD,
     FilteredSet,
     ModelFilters,
+)
+from bench.diagnosis.prediction_error.physically_equivalent_effects import (
+    get_servo_damping,
+    list_similar_shifts,
 )
 from bench.diagnosis.prediction_error.regression_columns import (
     LibraryColumns,

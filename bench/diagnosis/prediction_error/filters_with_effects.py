@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.dry_friction_form import has_soft_form, make_soft_kind
 from bench.diagnosis.evaluation.parameter_bounds import clip_coefficients, get_bounds_by_index
 from bench.diagnosis.fitting.fitted_models import FittedModel
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.friction_form_verdict import has_soft_form, make_soft_kind
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.effects_at_joints import (

@@ -5,28 +5,29 @@ fitted to whole simulated runs (output errors), which decide. The search ends as
 residual of a set is only noise. The order is:
 
     0. For a robot on the ground, fit the single effects that explain most of the residual of its
-       simulated pieces (`output_error_scores`).
+       simulated pieces (`effect_scores_on_ground`).
     1. Select effects with few shapes by regression. If the selection leaves a large residual of a
        robot with servos, identify the servos (`servo_identification`), and do nothing of the
        following. Otherwise fit the dry friction among them first, because it is not linear where a
        joint sticks (`dry_friction_fits`), and then the set (`simulated_fits`), also with a lag in
        place of a delay or the reverse (`competing_models`). If this fails, and friction acts at all
-       joints, select the other effects with it in the filter's model (`selection_with_friction`).
-       If this fails too, or before it if servos reach their limits, simulate single effects at
-       several coefficients, and fit the best of them (`single_effect_fits`).
+       joints, select the other effects with it in the filter's model
+       (`stepwise_selection_by_filters`). If this fails too, or before it if servos reach their
+       limits, simulate single effects at several coefficients, and fit the best of them
+       (`single_effect_fits`).
     2. If a force is still missing, select again, with effects of many shapes at the joints where it
        is missing (`regression_columns`), and replace laws that do not explain the runs by richer
        ones (`competing_models`).
     3. Fit each of the effects with the largest gains alone, and those of the standard joint model
        (`single_effect_fits`, `effect_proposals`).
     4. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
-       filters with the effect in the model (`forward_selection_by_filters`).
+       filters with the effect in the model (`stepwise_selection_by_filters`).
     5. Try one effect in place of several (`competing_models`).
     6. Simulate elasticity and backlash between a drive and its links (`single_effect_fits`). Those
        that remove most of the residual without being fitted come before 3.
 
 If a long recording shows that the model stays incomplete, filters alone identify its effects
-(`identification_without_simulation`), and nothing of the above is done.
+(`stepwise_selection_by_filters`), and nothing of the above is done.
 
 `PredictionErrorSearch.fit_competing_models` then fits the sets that are nearly as good, because
 they may be equivalent. All steps share filters with effects in the model (`filters_with_effects`),
@@ -40,15 +41,15 @@ from functools import cached_property
 
 import numpy as np
 
+from bench.diagnosis.dry_friction_form import has_dry_friction
 from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
 from bench.diagnosis.fitting.fitted_models import (
     MAX_ITERATIONS,
     FittedModel,
     select_likeliest,
 )
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.friction_form_verdict import has_dry_friction
 from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
 from bench.diagnosis.prediction_error.competing_models import (
     fit_competing_models,
@@ -64,19 +65,17 @@ from bench.diagnosis.prediction_error.dry_friction_fits import (
     fit_dry_friction,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
+from bench.diagnosis.prediction_error.effect_scores_on_ground import (
+    OutputErrorScores,
+    fit_best_scored,
+)
 from bench.diagnosis.prediction_error.effects_at_joints import acts_at_joint, has_series
+from bench.diagnosis.prediction_error.elasticity_and_backlash_fits import (
+    add_series_effect,
+    fit_series_effects,
+    simulate_series_effects,
+)
 from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
-from bench.diagnosis.prediction_error.forward_selection_by_filters import (
-    add_to_dry_friction,
-    add_to_model,
-    select_in_model,
-)
-from bench.diagnosis.prediction_error.identification_without_simulation import (
-    IdentifiedSet,
-    identify_incomplete,
-    simulate_identified,
-)
-from bench.diagnosis.prediction_error.output_error_scores import OutputErrorScores, fit_best_scored
 from bench.diagnosis.prediction_error.regression_columns import build_regression_about
 from bench.diagnosis.prediction_error.regression_selection import (
     Selected,
@@ -84,7 +83,6 @@ from bench.diagnosis.prediction_error.regression_selection import (
     score_by_regression,
     shows_step_errors,
 )
-from bench.diagnosis.prediction_error.selection_with_friction import select_with_friction
 from bench.diagnosis.prediction_error.servo_identification import (
     MIN_EXCESS,
     has_unknown_servos,
@@ -104,21 +102,26 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_nearly_explained,
     is_slow_to_simulate,
     remove_idle_effects,
+    simulate_identified,
 )
 from bench.diagnosis.prediction_error.single_effect_fits import (
-    add_series_effect,
     fit_likely_effects,
-    fit_series_effects,
     fit_single_effects,
     list_likely_starts,
-    simulate_series_effects,
+)
+from bench.diagnosis.prediction_error.stepwise_selection_by_filters import (
+    IdentifiedSet,
+    add_to_dry_friction,
+    add_to_model,
+    identify_incomplete,
+    select_in_model,
+    select_with_friction,
 )
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.fit_starts import add_effect_to_start
+from bench.diagnosis.search.fit_starts import add_effect_to_start, find_first_states
 from bench.diagnosis.search.score_test import CandidateScores
 from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
-from bench.diagnosis.validation.held_out_runs import find_first_states
 from sims.core.simulator import Array
 
 MIN_INCOMPLETE_SHARE = 0.6

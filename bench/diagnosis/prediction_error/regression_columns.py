@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.parameter_bounds import (
     clip_coefficients,
     compute_coefficient_bounds,
 )
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, KnownJacobian
+from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
 from bench.diagnosis.kalman.candidate_responses import (
     Columns,
     compute_columns,
@@ -34,7 +34,7 @@ from bench.diagnosis.prediction_error.regression_selection import (
     identify,
     regress,
 )
-from bench.diagnosis.search.candidate_directions import iterate_first_probes
+from bench.diagnosis.search.candidate_directions import list_probes
 from bench.diagnosis.search.lack_of_fit import JointHatForce, list_hat_probes
 from bench.diagnosis.search.score_test import DirectionGroup
 from sims.core.simulator import Array
@@ -254,30 +254,6 @@ def _has_similar_parameters(model: FittedModel, other: FittedModel) -> bool:
     theta, other_theta = model.fit.theta, other.fit.theta
     is_similar = np.abs(theta - other_theta) <= RELATIVE_DIFFERENCE * np.abs(other_theta)
     return model.effects == other.effects and bool(is_similar.all())
-
-
-def list_probes(
-    evaluator: RunEvaluator, model_effects: Sequence[str], names: Sequence[str]
-) -> list[CandidateDirection]:
-    """Return small trial coefficients (probes) of effects; their responses are regressors.
-
-    An effect has a probe for each of its coefficients in which it is linear, and these for each of
-    its shapes, for example for each period of a periodic force.
-
-    Args:
-        evaluator: the runs.
-        model_effects: names of the effects that the model contains.
-        names: names of the candidates.
-    """
-    probes: list[CandidateDirection] = []
-    for name in names:
-        bounds = compute_coefficient_bounds(evaluator, name)
-        for probe in iterate_first_probes(evaluator, model_effects, name):
-            # The value in the model file may be too large, so the correction may be negative.
-            low, _ = bounds[probe.coefficient_index]
-            can_be_negative = probe.can_be_negative or (low < 0 and not probe.is_single_size)
-            probes.append(replace(probe, can_be_negative=can_be_negative))
-    return probes
 
 
 def group_coefficients(

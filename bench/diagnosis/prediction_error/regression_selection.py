@@ -41,16 +41,16 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.benchmark.statistics.chi_squared import chi_squared_quantile, chi_squared_tail
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
+from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
 from bench.diagnosis.kalman.candidate_responses import (
     Columns,
     compute_columns,
     compute_responses,
     compute_step_error_response,
 )
-from bench.diagnosis.kalman.filter_and_smoother import IndexArray, Mask
+from bench.diagnosis.kalman.kalman_recursions import IndexArray, Mask
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-from bench.diagnosis.prediction_error.response_products import GramMatrices, ResponseProducts
+from bench.diagnosis.prediction_error.regression_products import GramMatrices, ResponseProducts
 from bench.diagnosis.search.score_test import (
     NULL_QUANTILE,
     CandidateScores,

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel
-from bench.diagnosis.prediction_error.identification_without_simulation import IdentifiedSet
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
 from bench.diagnosis.prediction_error.regression_selection import compute_p_value_of_gain
+from bench.diagnosis.prediction_error.stepwise_selection_by_filters import IdentifiedSet
 from bench.diagnosis.search.alternative_causes import (
     AlternativeFinder,
     CauseEvidence,

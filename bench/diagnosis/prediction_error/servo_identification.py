@@ -35,8 +35,7 @@ from bench.diagnosis.evaluation.parameter_bounds import (
     use_bounds,
 )
 from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.fitting.levenberg_marquardt_step import RIDGE_SHARE
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, solve_damped
 from bench.diagnosis.kalman.likelihood_fit import Information, compute_wald_statistics
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.effects_at_joints import (
@@ -511,7 +510,7 @@ class _ServoFitter:
         """
         laws = model.laws[joint]
         present = model.theta[self._list_parameters(joint, laws)]
-        stepped = present + _solve_damped(block, residual, damping)
+        stepped = present + solve_damped(block, residual, damping)
         clipped: Array = np.clip(stepped, *np.array(self._get_bounds(joint, laws)).T)
         return clipped
 
@@ -796,24 +795,6 @@ class _ServoFitter:
             gains |= compute_wald_statistics(self._evaluator, model.theta, laws, information)
         penalty = self.context.filters.penalty
         return {name: gain for name, gain in gains.items() if gain > penalty(name)}
-
-
-def _solve_damped(block: Array, residual: Array, damping: float) -> Array:
-    """Return the step (k,) of damped (Levenberg-Marquardt) least squares.
-
-    It solves (J'J + λ diag(J'J) + small ridge) x = J'r. The ridge, a small share of the largest
-    diagonal element, is needed for columns without any influence.
-
-    Args:
-        block: J (m, k), derivatives of m samples by k parameters.
-        residual: r (m,).
-        damping: λ.
-    """
-    normal = block.T @ block
-    diagonal = np.diag(normal)
-    ridge = damping * diagonal + RIDGE_SHARE * diagonal.max(initial=0.0)
-    step, *_ = np.linalg.lstsq(normal + np.diag(ridge), block.T @ residual, rcond=None)
-    return np.asarray(step)
 
 
 def _estimate_gain(block: Array, change: Array, residual: Array) -> float:

@@ -26,10 +26,10 @@ from functools import cached_property
 import numpy as np
 
 from bench.diagnosis.evaluation.parameter_bounds import Bounds, get_bounds_by_index
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
 from bench.diagnosis.kalman.settled_first_states import FirstStateFitter
 from sims.core.simulator import Array
-from sims.robot.dynamics.contact_states import KnownJacobians
+from sims.robot.dynamics.contact_equilibrium import KnownJacobians
 
 DIFFERENCE_SHARE = 0.02
 """Finite change of a coefficient, as a share of its plausible range."""

@@ -12,16 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.dry_friction_form import has_dry_friction
 from bench.diagnosis.fitting.base_fit import compute_start_costs
 from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
-from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.friction_form_verdict import has_dry_friction
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
 from bench.diagnosis.prediction_error.regression_selection import Selected
+from bench.diagnosis.search.fit_starts import make_replacing_start
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.effect import members_of
 from sims.core.simulator import Array
@@ -57,6 +57,9 @@ MAX_SINGLE_SQUARES_SHARE = 0.3
 """Maximum share of the squares beyond noise that a likely effect leaves before any fit."""
 MAX_NOISE_LIKE_COST = 1.5
 """Maximum mean squared residual, in units of the noise, at which no better start is searched."""
+
+MAX_STATE_ITERATIONS = 4
+"""Maximum number of iterations for the initial states of the simulated runs."""
 
 
 class RatedStart(NamedTuple):
@@ -358,32 +361,6 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
     return model
 
 
-def make_replacing_start(
-    evaluator: RunEvaluator,
-    model: FittedModel,
-    removed_effects: Sequence[str],
-    new_effect: str,
-    coefficients: Array,
-) -> FitStart:
-    """Return a start of a fit in which one effect replaces several others of a model.
-
-    All other parameters and the first states are those of the model.
-
-    Args:
-        evaluator: the runs.
-        model: the fitted model.
-        removed_effects: effects that are removed.
-        new_effect: the effect that replaces them.
-        coefficients: (k,) coefficients of the new effect.
-    """
-    theta = model.fit.theta.copy()
-    for name in removed_effects:
-        theta[evaluator.coefficient_slices[name]] = 0.0
-    theta[evaluator.coefficient_slices[new_effect]] = coefficients
-    remaining = (name for name in model.effects if name not in removed_effects)
-    return FitStart((*remaining, new_effect), theta, model.fit.initial_states)
-
-
 def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedModel:
     """Fit the selected set by simulation, without effects that gain little.
 
@@ -507,3 +484,23 @@ def is_slow_to_simulate(context: SearchContext, names: Sequence[str]) -> bool:
         for effect in effects
         for member in members_of(effect)
     )
+
+
+def simulate_identified(context: SearchContext, start: FitStart) -> FittedModel:
+    """Simulate the runs with identified parameters, from fitted initial states.
+
+    Only the initial states are fitted, in a few iterations. The fit with the derivatives by all
+    parameters, which the search needs, then makes no step.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        start: the parameters, and estimates of the initial states.
+    """
+    evaluator, search = context.evaluator, context.search
+    (fitted_states,) = TrajectoryFitter(
+        evaluator, search.noise, search.fixed_parameters, fits_parameters=False
+    ).fit_models([start], MAX_STATE_ITERATIONS)
+    (fit,) = TrajectoryFitter(evaluator, search.noise, search.fixed_parameters).fit_models(
+        [replace(start, initial_states=fitted_states.initial_states)], 0
+    )
+    return search.add_fit(fit)

@@ -4,9 +4,22 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from bench.diagnosis.report.effect_and_unit_text import ALL_PLACES, split_effect_name
+from bench.diagnosis.report.cause_and_value_text import (
+    ALL_PLACES,
+    format_effect_name,
+    format_effect_set,
+    format_sentence,
+    get_place_kind,
+    sanitise,
+    split_effect_name,
+    strip_place,
+)
+from bench.diagnosis.report.diagnosed_places import find_joint
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.verdict import Candidate
+from bench.pages.page_table import Table
+from sims import effects
+from sims.core.simulator import InputError
 
 MAX_SHOWN_CANDIDATES = 12
 """Maximum number of candidates that a figure shows."""
@@ -14,6 +27,9 @@ MIN_FAMILY_SCORE_RATIO = 1.3
 """Minimum ratio of a family's score to that of its best place for the family to represent the
 effect.
 """
+
+BEST, ELSEWHERE = "the best of each effect", "the same at other places"
+"""Labels of the rows of a robot's candidates, for the filter."""
 
 
 class RankedCandidate(NamedTuple):
@@ -99,3 +115,81 @@ def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
     needed_count = len(ordered_candidates) - len(unneeded_candidates)
     hidden_candidates = unneeded_candidates[max(0, MAX_SHOWN_CANDIDATES - needed_count) :]
     return [c for c in ordered_candidates if c not in hidden_candidates]
+
+
+def build_candidate_table(report: DiagnosisReportData) -> Table:
+    """Build a table with one row per candidate, the highest score first.
+
+    `set` names the candidates that the data cannot distinguish from it. `shown` says which rows are
+    visible at first: of an effect that acts at several places, only the best one. Columns that
+    would be empty are left out.
+
+    Args:
+        report: Data of the report.
+    """
+    sets = _map_indistinguishable_sets(report)
+    representatives = {entry.best.effect for entry in rank_candidates(report)}
+    rows = []
+    for candidate in sorted(report.verdict.candidates, key=lambda candidate: -candidate.score):
+        effect = candidate.effect
+        base, place = split_effect_name(effect)
+        place_kind = get_place_kind(effect)
+        # Without a diagnosed cause, the status would be "not needed", which would be wrong.
+        status = "not convincing"
+        if report.has_extended_model:
+            status = get_candidate_status(report, effect)
+        rows.append(
+            {
+                # A place has its own column.
+                "candidate": sanitise(format_effect_name(base), 120),
+                "effect": sanitise(effect, 120),
+                "score": candidate.score,
+                "p_value": candidate.p_value,
+                "heldout_gain": candidate.heldout_gain,
+                "standing": status,
+                "set": sets.get(effect, ""),
+                "kind": place_kind,
+                "place": "all" if place == ALL_PLACES else sanitise(place, 80),
+                "joint": find_joint(report, place_kind, place),
+                "shown": BEST if effect in representatives else ELSEWHERE,
+                "says": _get_effect_description(report, effect),
+            }
+        )
+    return Table.from_rows(rows).without(_list_empty_columns(report))
+
+
+def _list_empty_columns(report: DiagnosisReportData) -> list[str]:
+    """List the columns that would be empty."""
+    columns = [] if _map_indistinguishable_sets(report) else ["set"]
+    return columns + ([] if has_placed_causes(report) else ["kind", "place", "joint", "shown"])
+
+
+def _map_indistinguishable_sets(report: DiagnosisReportData) -> dict[str, str]:
+    """Return, by effect, the set of effects that it is indistinguishable from."""
+    sets: dict[str, str] = {}
+    for cause in report.verdict.causes:
+        if cause.alternatives:
+            members = [cause.effect, *cause.alternatives]
+            sets |= dict.fromkeys(members, sanitise(format_effect_set(members), 160))
+    return sets
+
+
+def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
+    """Return the description of an effect as a sentence; for a cause, the one in the verdict.
+
+    It is empty for an effect that is not registered: one of a plugin that is not loaded, or a
+    numerical setting such as the time step.
+
+    Args:
+        report: content of the report.
+        name: name of the effect, with its place if it has one.
+    """
+    for cause in report.verdict.causes:
+        if cause.effect == name:
+            return format_sentence(strip_place(sanitise(cause.says, 400)))
+    base, place = split_effect_name(name)
+    try:
+        effect = effects.get_effect(base)
+    except InputError:
+        return ""
+    return format_sentence((effect.says_at_place if place else "") or effect.says)

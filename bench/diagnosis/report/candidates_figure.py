@@ -14,15 +14,16 @@ from bench.diagnosis.report.candidate_ranking import (
     rank_candidates,
     select_shown_candidates,
 )
-from bench.diagnosis.report.cause_text import shorten_effect_name
-from bench.diagnosis.report.effect_and_unit_text import (
+from bench.diagnosis.report.cause_and_value_text import (
     format_number,
     format_p_value,
     format_percent,
     sanitise,
+    shorten_effect_name,
 )
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from bench.diagnosis.verdict import Candidate
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.label_text import break_name, count_max_lines, measure_text_width
 from bench.figures.style import (
     BLUE,
@@ -31,9 +32,8 @@ from bench.figures.style import (
     NOISE_BAND_GREY,
     SKY_BLUE,
     ZERO_LINE_GREY,
-    make_panel_grid,
 )
-from sims.core.plain_values import format_count
+from sims.core.user_messages import format_count
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from bench.diagnosis.report.cause_text import MODEL_FILE_ERRORS
-from bench.diagnosis.report.effect_and_unit_text import (
+from bench.diagnosis.report.cause_and_value_text import (
     ALL_PLACES,
     QUANTITY_LABELS,
-    append_unit,
+    format_coefficient,
     format_effect_name,
-    format_number,
-    format_percent,
     get_place_kind,
     sanitise,
     split_effect_name,
@@ -36,7 +33,7 @@ def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
             noun, kind = format_effect_name(base), get_place_kind(name)
             for place in _list_places(report, name, cause):
                 # The coefficients are those of the cause, not of its alternatives.
-                size = _format_coefficient(cause, name, place) if name == cause.effect else ""
+                size = format_coefficient(cause, name, place) if name == cause.effect else ""
                 mark = PlaceMark(kind, place, f"{noun}{size}", is_certain)
                 # An effect at all places and one of its places give the same mark.
                 marks.setdefault((kind, place, noun), mark)
@@ -72,32 +69,6 @@ def _list_places(report: DiagnosisReportData, effect: str, cause: Cause) -> list
         "body": [body.name for body in robot.bodies],
     }
     return tables.get(get_place_kind(effect), [])
-
-
-def _format_coefficient(cause: Cause, effect: str, place: str) -> str:
-    """Format the coefficient of a cause at a place for a label, such as ``: +12 %``.
-
-    The text is empty if the cause has several coefficients there. A relative change of a value of
-    the model file is given in percent, others with their unit.
-
-    Args:
-        cause: the cause with its coefficients.
-        effect: name of the effect, with its place.
-        place: place of the label, such as a joint.
-    """
-    at_place = []
-    for name, fitted_value in cause.coefficients.items():
-        _, coefficient_place = split_effect_name(name)
-        if coefficient_place in ("", place):
-            at_place.append(fitted_value)
-    if len(at_place) != 1:
-        return ""
-    (fitted,) = at_place
-    base, _ = split_effect_name(effect)
-    if base in MODEL_FILE_ERRORS and fitted.unit == "1":
-        sign = "+" if fitted.value > 0 else ""
-        return f": {sign}{format_percent(fitted.value)}"
-    return f": {append_unit(format_number(fitted.value, 2), fitted.unit)}"
 
 
 def find_joint(report: DiagnosisReportData, kind: str, place: str) -> str:

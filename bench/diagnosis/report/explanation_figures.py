@@ -24,10 +24,10 @@ from bench.diagnosis.report.residual_figure import (
 )
 from bench.diagnosis.report.run_selection import RunView, select_worst_run
 from bench.figures import figure_output
+from bench.figures.figure_layout import apply_settings
 from bench.figures.figure_output import FigureFiles
 from bench.figures.figure_settings import is_pdf_wanted
 from bench.figures.robot_figure import compute_joint_positions, draw_robot_figure
-from bench.figures.style import apply_settings
 from sims.core.simulator import InputError, make_unknown_name_error
 
 if TYPE_CHECKING:

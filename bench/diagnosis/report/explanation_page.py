@@ -8,15 +8,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
-from bench.diagnosis.report import cause_text, effect_and_unit_text, summary_text
+from bench.diagnosis.report import cause_and_value_text, summary_text
 from bench.diagnosis.report.candidate_ranking import (
-    get_candidate_status,
+    BEST,
+    build_candidate_table,
     has_placed_causes,
-    rank_candidates,
 )
-from bench.diagnosis.report.cause_text import format_effect_set, strip_place
+from bench.diagnosis.report.cause_and_value_text import (
+    format_label,
+    sanitise,
+)
 from bench.diagnosis.report.consistency_section import (
     MAX_TABLE_ROWS,
     build_agreement_rows,
@@ -24,15 +25,6 @@ from bench.diagnosis.report.consistency_section import (
     pluralise_group,
 )
 from bench.diagnosis.report.diagnosed_places import find_joint, list_place_marks
-from bench.diagnosis.report.effect_and_unit_text import (
-    ALL_PLACES,
-    format_effect_name,
-    format_label,
-    format_sentence,
-    get_place_kind,
-    sanitise,
-    split_effect_name,
-)
 from bench.diagnosis.report.identifiability_section import build_identifiability_section
 from bench.diagnosis.report.joint_figure import is_robot
 from bench.diagnosis.report.motion_chart import (
@@ -42,10 +34,10 @@ from bench.diagnosis.report.motion_chart import (
     make_motion_chart,
 )
 from bench.diagnosis.report.report_data import (
-    DataSplit,
     DiagnosisReportData,
     ResidualProfile,
 )
+from bench.diagnosis.report.residual_analysis import compute_channel_errors
 from bench.diagnosis.report.residual_figure import MAX_LABEL_LENGTH, select_informative_profiles
 from bench.diagnosis.validation.confidence_intervals import Z95
 from bench.figures.figure_output import FigureFiles
@@ -54,91 +46,9 @@ from bench.pages.chart import Axis, Panel, Series
 from bench.pages.html_page import HtmlPage
 from bench.pages.interval_drawing import draw_intervals
 from bench.pages.page_table import Table
-from sims import effects
-from sims.core.simulator import Array, InputError
 
 CANDIDATE_TABLE, GAP_LOCATION_TABLE, RESIDUAL_PROFILE_TABLE = "candidates", "where", "follows"
 """Names of the tables."""
-BEST, ELSEWHERE = "the best of each effect", "the same at other places"
-"""Labels of the rows of a robot's candidates, for the filter."""
-
-
-def build_candidate_table(report: DiagnosisReportData) -> Table:
-    """Build a table with one row per candidate, the highest score first.
-
-    `set` names the candidates that the data cannot distinguish from it. `shown` says which rows are
-    visible at first: of an effect that acts at several places, only the best one. Columns that
-    would be empty are left out.
-
-    Args:
-        report: Data of the report.
-    """
-    sets = _map_indistinguishable_sets(report)
-    representatives = {entry.best.effect for entry in rank_candidates(report)}
-    rows = []
-    for candidate in sorted(report.verdict.candidates, key=lambda candidate: -candidate.score):
-        effect = candidate.effect
-        base, place = split_effect_name(effect)
-        place_kind = get_place_kind(effect)
-        # Without a diagnosed cause, the status would be "not needed", which would be wrong.
-        status = "not convincing"
-        if report.has_extended_model:
-            status = get_candidate_status(report, effect)
-        rows.append(
-            {
-                # A place has its own column.
-                "candidate": sanitise(format_effect_name(base), 120),
-                "effect": sanitise(effect, 120),
-                "score": candidate.score,
-                "p_value": candidate.p_value,
-                "heldout_gain": candidate.heldout_gain,
-                "standing": status,
-                "set": sets.get(effect, ""),
-                "kind": place_kind,
-                "place": "all" if place == ALL_PLACES else sanitise(place, 80),
-                "joint": find_joint(report, place_kind, place),
-                "shown": BEST if effect in representatives else ELSEWHERE,
-                "says": _get_effect_description(report, effect),
-            }
-        )
-    return Table.from_rows(rows).without(_list_empty_columns(report))
-
-
-def _list_empty_columns(report: DiagnosisReportData) -> list[str]:
-    """List the columns that would be empty."""
-    columns = [] if _map_indistinguishable_sets(report) else ["set"]
-    return columns + ([] if has_placed_causes(report) else ["kind", "place", "joint", "shown"])
-
-
-def _map_indistinguishable_sets(report: DiagnosisReportData) -> dict[str, str]:
-    """Return, by effect, the set of effects that it is indistinguishable from."""
-    sets: dict[str, str] = {}
-    for cause in report.verdict.causes:
-        if cause.alternatives:
-            members = [cause.effect, *cause.alternatives]
-            sets |= dict.fromkeys(members, sanitise(format_effect_set(members), 160))
-    return sets
-
-
-def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
-    """Return the description of an effect as a sentence; for a cause, the one in the verdict.
-
-    It is empty for an effect that is not registered: one of a plugin that is not loaded, or a
-    numerical setting such as the time step.
-
-    Args:
-        report: content of the report.
-        name: name of the effect, with its place if it has one.
-    """
-    for cause in report.verdict.causes:
-        if cause.effect == name:
-            return format_sentence(strip_place(sanitise(cause.says, 400)))
-    base, place = split_effect_name(name)
-    try:
-        effect = effects.get_effect(base)
-    except InputError:
-        return ""
-    return format_sentence((effect.says_at_place if place else "") or effect.says)
 
 
 def build_gap_location_table(report: DiagnosisReportData) -> Table:
@@ -316,24 +226,7 @@ def render_report(
         MAX_TABLE_ROWS=MAX_TABLE_ROWS,
         Z95=Z95,
         pluralise_group=pluralise_group,
-        causes=cause_text,
+        causes=cause_and_value_text,
         summary=summary_text,
-        wording=effect_and_unit_text,
+        wording=cause_and_value_text,
     )
-
-
-def compute_channel_errors(split: DataSplit) -> Array:
-    """Compute each channel's RMSE (C, 2) before and after, in its unit; NaN without samples.
-
-    Args:
-        split: Recorded runs with the simulation before and after the causes are added.
-    """
-    channel_count = split.observed.shape[2]
-    errors = np.full((channel_count, 2), np.nan)
-    for column, simulated in enumerate((split.before, split.after)):
-        for channel_index in range(channel_count):
-            residual = (split.observed - simulated)[:, :, channel_index]
-            # The mean of an empty set would cause a warning.
-            if np.isfinite(residual).any():
-                errors[channel_index, column] = np.sqrt(np.nanmean(residual**2))
-    return errors

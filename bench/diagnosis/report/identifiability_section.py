@@ -13,8 +13,10 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from bench.diagnosis.identifiability import ParameterIdentifiability
-from bench.diagnosis.report.effect_and_unit_text import (
+import numpy as np
+
+from bench.diagnosis.identifiability import IdentifiabilityLevel, ParameterIdentifiability
+from bench.diagnosis.report.cause_and_value_text import (
     ALL_PLACES,
     format_effect_name,
     get_place_kind,
@@ -22,7 +24,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.verdict import Cause
-from sims.core.plain_values import join_first_names
+from sims.core.user_messages import format_unit, join_first_names
 
 MAX_NAMED_CAUSES = 6
 """Maximum number of names in a cell or list; the remaining ones are counted."""
@@ -35,6 +37,11 @@ _LEGEND = {
 }
 """Sign and meaning of each status of a cause, the most certain first."""
 _STATUSES = tuple(_LEGEND)
+
+MAX_LISTED_CAUSES = 8
+"""Maximum number of causes with their own line, and of names in a list, in the terminal."""
+
+_WORDS: tuple[IdentifiabilityLevel, ...] = ("identifiable", "weak", "not identifiable")
 
 
 class CauseRow(NamedTuple):
@@ -216,3 +223,71 @@ def _build_family_table(
         }
         for family, by_status in names.items()
     }
+
+
+def format_identifiability(assessments: Sequence[ParameterIdentifiability]) -> list[str]:
+    """Format the free parameters and the best identifiable causes as lines for the terminal.
+
+    Args:
+        assessments: identifiability of each free parameter, then of each cause, best first.
+    """
+    lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
+    lines += [f"  {_format_parameter(number)}" for number in assessments if number.free]
+    causes = {level: [n for n in assessments if not n.free and n.word == level] for level in _WORDS}
+    counts = [f"{len(members)} {level}" for level, members in causes.items()]
+    lines.append(f"causes, each considered alone, smallest uncertainty first: {', '.join(counts)}")
+    # A limit has no interval, and follows the causes that have one.
+    identifiable = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
+    lines += [f"  {_format_parameter(number)}" for number in identifiable[:MAX_LISTED_CAUSES]]
+    # The other causes are named only.
+    other_causes = {
+        "also identifiable": identifiable[MAX_LISTED_CAUSES:],
+        "weak": causes["weak"],
+        "not identifiable": causes["not identifiable"],
+    }
+    for level, members in other_causes.items():
+        if members:
+            names = join_first_names(_count_effects(members), MAX_LISTED_CAUSES)
+            lines.append(f"  {level}: {names}")
+    if any(len(members) > MAX_LISTED_CAUSES for members in causes.values()):
+        lines.append("  all causes with their intervals: the same command with --json")
+    return lines
+
+
+def _format_parameter(number: ParameterIdentifiability) -> str:
+    """Format one parameter with its level, interval, range and confounded parameters.
+
+    A limit or backlash has no interval (NaN), and a parameter without influence an infinite one.
+
+    Args:
+        number: identifiability of a parameter, or of a coefficient of a cause.
+    """
+    if np.isfinite(number.half):
+        interval_text = f"±{number.half:.2g} {format_unit(number.unit)}".rstrip()
+    elif np.isnan(number.half):
+        interval_text = "a limit inside the range of the data"
+    else:
+        interval_text = "no influence"
+    confounder_text = join_first_names([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
+    confounding_note = f"; confounded with {confounder_text}" if confounder_text else ""
+    span = f"{number.low:.3g} to {number.high:.3g}"
+    return (
+        f"{number.word:16s} {number.name}: {interval_text} (plausible range "
+        f"{span}){confounding_note}"
+    )
+
+
+def _count_effects(assessments: Sequence[ParameterIdentifiability]) -> list[str]:
+    """List the effects of causes once each, with the number of their places if there are several.
+
+    The name of a cause is that of its effect with its place, and of its coefficient after a space.
+    """
+    places: dict[str, set[str]] = {}
+    for number in assessments:
+        placed_effect, _, _ = number.name.partition(" ")
+        effect, _, place = placed_effect.partition("@")
+        places.setdefault(effect, set()).add(place)
+    return [
+        f"{effect} ({len(effect_places)} places)" if len(effect_places) > 1 else effect
+        for effect, effect_places in places.items()
+    ]

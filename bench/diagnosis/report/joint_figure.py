@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.report.diagnosed_places import list_marked_joints, list_place_marks
-from bench.diagnosis.report.effect_and_unit_text import (
+from bench.diagnosis.report.cause_and_value_text import (
     QUANTITY_LABELS,
     format_number,
     sanitise,
     shorten_label,
 )
+from bench.diagnosis.report.diagnosed_places import list_marked_joints, list_place_marks
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.report.run_selection import RunView, format_selected_run, select_worst_run
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.label_text import POINTS, break_name, measure_text_width
 from bench.figures.signal_thinning import thin_signal
 from bench.figures.style import (
@@ -31,7 +32,6 @@ from bench.figures.style import (
     NEUTRAL_MARK,
     NOISE_BAND_GREY,
     ZERO_LINE_GREY,
-    make_panel_grid,
 )
 from sims.core.root_mean_square import compute_rms
 

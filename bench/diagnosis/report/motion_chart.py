@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.report.effect_and_unit_text import (
+from bench.diagnosis.report.cause_and_value_text import (
     QUANTITY_LABELS,
     format_label,
     format_number,

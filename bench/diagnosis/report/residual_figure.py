@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.report.effect_and_unit_text import format_label, sanitise
+from bench.diagnosis.report.cause_and_value_text import format_label, sanitise
 from bench.diagnosis.report.report_data import (
     DiagnosisReportData,
     GapLocation,
     ResidualProfile,
 )
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.label_text import break_name, count_max_lines, measure_text_width
 from bench.figures.style import (
     BASE_MODEL_LINE,
@@ -24,7 +25,6 @@ from bench.figures.style import (
     NEUTRAL_MARK,
     NULL_LEVEL_GREY,
     ZERO_LINE_GREY,
-    make_panel_grid,
 )
 
 if TYPE_CHECKING:

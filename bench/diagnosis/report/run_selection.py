@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.report.effect_and_unit_text import shorten_label
+from bench.diagnosis.report.cause_and_value_text import shorten_label
 from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
 from sims.core.simulator import Array
 

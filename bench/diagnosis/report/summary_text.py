@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from bench.diagnosis.evaluation.search_control import QUESTION_TEXTS, EarlyStop
-from bench.diagnosis.report import candidate_ranking, cause_text, detectable_gap
-from bench.diagnosis.report import effect_and_unit_text as wording
-from bench.diagnosis.report.consistency_section import format_consistency as format_consistency
-from bench.diagnosis.report.effect_and_unit_text import (
+from bench.diagnosis.report import candidate_ranking, cause_and_value_text, detectable_gap
+from bench.diagnosis.report import cause_and_value_text as wording
+from bench.diagnosis.report.cause_and_value_text import (
     append_unit,
     at_bound,
     format_estimate,
@@ -24,6 +23,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
     format_sentence,
     sanitise,
 )
+from bench.diagnosis.report.consistency_section import format_consistency as format_consistency
 from bench.diagnosis.report.report_data import (
     DataSplit,
     DiagnosisReportData,
@@ -60,7 +60,7 @@ def _load_sentences() -> Any:
     return load_template(_TEMPLATE).make_module(
         {
             "summary": sys.modules[__name__],
-            "causes": cause_text,
+            "causes": cause_and_value_text,
             "ranking": candidate_ranking,
             "gaps": detectable_gap,
             "wording": wording,

@@ -18,7 +18,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.search.effect_search import (
     FAR_EXCESS,
     MAX_RICHER_LAW_EXCESS_RATIO,
@@ -28,6 +28,7 @@ from bench.diagnosis.search.fit_starts import generate_shifted_starts
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.score_test import estimate_tail_p_value
+from bench.diagnosis.search.scored_models import list_submodels
 from bench.diagnosis.search.verdict_rules import (
     compute_excess_ratio,
     convert_excess_ratio,
@@ -223,24 +224,6 @@ def _is_competitive(search: EffectSearch, other_model: FittedModel, model: Fitte
     return search.compute_excess_residual(
         other_model
     ) < MAX_COMPETITOR_EXCESS_RATIO * search.compute_excess_residual(model)
-
-
-def list_submodels(search: EffectSearch, model: FittedModel) -> list[FittedModel]:
-    """Return the fitted models that have all effects of a model except one.
-
-    From each of them, the gain of the missing effect is measured.
-
-    Args:
-        search: the search, with all fitted models.
-        model: the model with all effects.
-    """
-    names = set(model.effects)
-    size = len(names) - 1
-    submodels = []
-    for other_model in search.models.values():
-        if len(other_model.effects) == size and set(other_model.effects) < names:
-            submodels.append(other_model)
-    return submodels
 
 
 def _estimate_model_noise(search: EffectSearch, model: FittedModel) -> NoiseModel | None:

@@ -16,18 +16,25 @@ the input reaches it), the direction is the whole change at one size, and is val
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
 from bench.diagnosis.evaluation.noise_model import Mask
-from bench.diagnosis.evaluation.parameter_bounds import MIN_CYCLES_PER_RUN, list_coefficients
-from bench.diagnosis.evaluation.plausible_ranges import MAX_DECAY_FACTOR, is_instant, is_period
+from bench.diagnosis.evaluation.parameter_bounds import (
+    MIN_CYCLES_PER_RUN,
+    compute_coefficient_bounds,
+    list_coefficients,
+)
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
-from bench.diagnosis.fitting.levenberg_marquardt_step import is_finite_response
+from bench.diagnosis.evaluation.time_scaled_ranges import MAX_DECAY_FACTOR, is_instant, is_period
+from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
+from bench.diagnosis.fitting.trajectory_derivatives import (
+    CandidateDirection,
+    get_linearisation,
+    is_finite_response,
+)
 from bench.diagnosis.search.reachable_levels import compute_reachable_levels
 from sims.core.effect import ALL_PLACES, Effect, Input, members_of
 from sims.core.simulator import Array, Parameter
@@ -640,7 +647,6 @@ def compute_responses(
     """
     if evaluator.has_linearisation:
         # Imported here, because only robots need it.
-        from bench.diagnosis.fitting.linearised_runs import compute_effect_responses
 
         return compute_effect_responses(evaluator, fit.theta, fit.initial_states, added)
     values = simulate_with_effect(evaluator, fit, added)
@@ -676,3 +682,104 @@ def simulate_with_effect(
         states=np.tile(fit.initial_states, (effect_count, 1)),
     )
     return simulated.reshape(effect_count, run_count, *simulated.shape[1:])
+
+
+def compute_effect_responses(
+    evaluator: RunEvaluator, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
+) -> Array:
+    """Compute how the runs of a robot change to first order if one effect is added, for K effects.
+
+    Linearised dynamics cost much less than a simulation for each effect. Series effects (a further
+    joint in series with a joint, such as backlash) cannot be linearised; they are simulated, and
+    the result is cached. The result has single precision, because it is by far the largest array of
+    an explanation and only a derivative.
+
+    Shapes: R runs, T samples, C channels, P parameters, s states of a run.
+
+    Args:
+        evaluator: evaluator of the recorded runs of a robot.
+        theta: (P,) parameters, without the added effects.
+        states: (R, s) initial states.
+        added: K effects with their coefficients.
+
+    Returns:
+        Changes of the runs (K, R, T, C); NaN where they are not finite.
+    """
+    # This import is needed for robots only.
+    from sims.robot.dynamics.series_joints import is_series_effect
+
+    runs, length, channels = evaluator.observed.shape
+    responses: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
+    cached_responses = evaluator.cached_responses
+    keys = [(name, coefficients.tobytes()) for name, coefficients in added]
+    missing_indices = [i for i, key in enumerate(keys) if key not in cached_responses]
+    worker_arguments = [
+        (run, theta, states[run], [added[i] for i in missing_indices]) for run in range(runs)
+    ]
+    for run, (values, simulation_count) in evaluator.worker_pool.map_unordered(
+        evaluator, _compute_responses, worker_arguments
+    ):
+        # Values that overflow single precision become infinite here.
+        with np.errstate(over="ignore"):
+            responses[missing_indices, run, : values.shape[1]] = values
+        evaluator.simulation_count += simulation_count
+    responses[~is_finite_response(responses)] = np.nan
+    for i, (name, _) in enumerate(added):
+        key = keys[i]
+        if key in cached_responses:
+            responses[i] = cached_responses[key]
+        elif is_series_effect(evaluator.available_effects[name]):
+            # Simulated responses cost more, and are similar in all models near the data.
+            cached_responses[key] = responses[i].copy()
+    return responses
+
+
+def _compute_responses(
+    evaluator: RunEvaluator,
+    run: int,
+    theta: Array,
+    states: Array,
+    added: Sequence[tuple[str, Array]],
+) -> tuple[Array, int]:
+    """Compute how one run changes by each of K added effects (K, T, C); runs in a worker.
+
+    Also return the number of simulations that were needed, since not all effects have a
+    linearisation.
+
+    Shapes: T samples, C channels, P parameters, s states of a run.
+
+    Args:
+        evaluator: run evaluator of all runs.
+        run: index of the run.
+        theta: (P,) parameters of the model without the added effects.
+        states: (s,) initial state of the run.
+        added: name and coefficients of each added effect.
+    """
+    linearisation = get_linearisation(evaluator, run, theta, states)
+    return linearisation.compute_effect_responses(
+        [(evaluator.available_effects[name], c) for name, c in added]
+    )
+
+
+def list_probes(
+    evaluator: RunEvaluator, model_effects: Sequence[str], names: Sequence[str]
+) -> list[CandidateDirection]:
+    """Return small trial coefficients (probes) of effects; their responses are regressors.
+
+    An effect has a probe for each of its coefficients in which it is linear, and these for each of
+    its shapes, for example for each period of a periodic force.
+
+    Args:
+        evaluator: the runs.
+        model_effects: names of the effects that the model contains.
+        names: names of the candidates.
+    """
+    probes: list[CandidateDirection] = []
+    for name in names:
+        bounds = compute_coefficient_bounds(evaluator, name)
+        for probe in iterate_first_probes(evaluator, model_effects, name):
+            # The value in the model file may be too large, so the correction may be negative.
+            low, _ = bounds[probe.coefficient_index]
+            can_be_negative = probe.can_be_negative or (low < 0 and not probe.is_single_size)
+            probes.append(replace(probe, can_be_negative=can_be_negative))
+    return probes

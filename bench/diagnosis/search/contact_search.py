@@ -26,7 +26,7 @@ from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_boun
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
 from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.kalman.cubature_filter import (
     FIRST_STATE_MARGIN,
     FilterHypothesis,

@@ -17,7 +17,7 @@ from itertools import chain
 import numpy as np
 
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet, select_likeliest
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.multiple_shooting import (
     forgets_initial_state,
     join_segment_fits,

@@ -16,17 +16,18 @@ from bench.diagnosis.evaluation.parameter_bounds import (
     compute_coefficient_bounds,
     list_coefficients,
 )
-from bench.diagnosis.evaluation.plausible_ranges import is_instant, is_period
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.time_scaled_ranges import is_instant, is_period
 from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
 from bench.diagnosis.fitting.fitted_models import EffectNames, FittedModel
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, KnownJacobian, TrajectoryFit
 from bench.diagnosis.search.candidate_directions import (
     EVENT_TIME_COUNT,
     DirectionSet,
     generate_end_stops,
 )
 from bench.diagnosis.search.score_test import CandidateScores, DirectionGroup
+from bench.diagnosis.validation.held_out_runs import MIN_SQUARES_DECREASE, HeldOutRuns
 from sims.core.simulator import Array, Parameter
 
 MAX_REFITS_BY_SQUARES = 3
@@ -570,3 +571,59 @@ def _shift_frequency_or_time(
             # Beyond the longest period, the frequency might become negative.
             lowest_frequency = 1.0 / parameter.bounds[1]
             yield 1.0 / max(frequency, lowest_frequency)
+
+
+def find_first_states(
+    evaluator: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit
+) -> FitStart | None:
+    """Return a start with better initial states of the fitted runs; None without better ones.
+
+    A fit may have stopped in a local minimum of the initial states. So these are fitted again with
+    the parameters of the fit, to ever longer parts of the runs, like those of held-out runs. They
+    must reduce the sum of squares by at least `MIN_SQUARES_DECREASE`. A robot on the ground keeps
+    its initial states, those with settled contacts.
+
+    Args:
+        evaluator: the fitted runs.
+        noise: noise that weights the channels.
+        fit: fit of these runs.
+    """
+    filtered_runs = evaluator.filtered_runs
+    if filtered_runs is not None and filtered_runs.is_on_ground:
+        return None
+    # The fit may replace these derivatives, which other fits of the runs use.
+    derivatives_before = evaluator.state_derivatives
+    runs = HeldOutRuns(evaluator, noise)
+    (prediction,) = runs.fit_initial_states([fit.theta], is_staged=True)
+    evaluator.state_derivatives = derivatives_before
+    squares = np.square((evaluator.observed - prediction.simulated) / noise.sigma)
+    # The comparison is negated because a failed prediction is NaN.
+    if not squares[runs.seen].sum() < fit.cost - MIN_SQUARES_DECREASE:
+        return None
+    return replace(fit.make_start(), initial_states=prediction.states)
+
+
+def make_replacing_start(
+    evaluator: RunEvaluator,
+    model: FittedModel,
+    removed_effects: Sequence[str],
+    new_effect: str,
+    coefficients: Array,
+) -> FitStart:
+    """Return a start of a fit in which one effect replaces several others of a model.
+
+    All other parameters and the first states are those of the model.
+
+    Args:
+        evaluator: the runs.
+        model: the fitted model.
+        removed_effects: effects that are removed.
+        new_effect: the effect that replaces them.
+        coefficients: (k,) coefficients of the new effect.
+    """
+    theta = model.fit.theta.copy()
+    for name in removed_effects:
+        theta[evaluator.coefficient_slices[name]] = 0.0
+    theta[evaluator.coefficient_slices[new_effect]] = coefficients
+    remaining = (name for name in model.effects if name not in removed_effects)
+    return FitStart((*remaining, new_effect), theta, model.fit.initial_states)

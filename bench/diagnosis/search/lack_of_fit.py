@@ -29,10 +29,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
+from bench.diagnosis.evaluation.autoregressive_surrogates import draw_surrogates
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
+from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
 from bench.diagnosis.search.candidate_directions import (
     DirectionSet,
     compute_responses,

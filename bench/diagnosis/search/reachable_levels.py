@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.diagnosis.evaluation.initial_state_guesses import RunData
 from bench.diagnosis.evaluation.parameter_bounds import list_coefficients
-from bench.diagnosis.evaluation.run_data import RunData
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array

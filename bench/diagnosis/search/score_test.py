@@ -44,7 +44,7 @@ from bench.diagnosis.evaluation.noise_model import (
     compute_log_determinant,
 )
 from bench.diagnosis.evaluation.run_evaluator import Indices
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.whitened_products import RANK_TOLERANCE, InnerProducts, WhiteningDesign
 from sims.core.simulator import Array

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.diagnosis.evaluation.autoregressive_surrogates import draw_surrogates
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, compute_portmanteau_p_value
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.search.fit_starts import select_refit_starts
 from bench.diagnosis.search.score_test import (
@@ -594,3 +594,21 @@ def _score_residual(
         ),
         SURROGATE_COUNT,
     )
+
+
+def list_submodels(search: ScoredModelSet, model: FittedModel) -> list[FittedModel]:
+    """Return the fitted models that have all effects of a model except one.
+
+    From each of them, the gain of the missing effect is measured.
+
+    Args:
+        search: the search, with all fitted models.
+        model: the model with all effects.
+    """
+    names = set(model.effects)
+    size = len(names) - 1
+    submodels = []
+    for other_model in search.models.values():
+        if len(other_model.effects) == size and set(other_model.effects) < names:
+            submodels.append(other_model)
+    return submodels

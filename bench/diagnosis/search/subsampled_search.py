@@ -6,18 +6,15 @@ all samples only if these show more than the subsampled runs did.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from bench.diagnosis.evaluation.run_evaluator import MAX_TIME_STEP, Indices, RunEvaluator
+from bench.diagnosis.evaluation.run_evaluator import MAX_TIME_STEP, RunEvaluator
 from bench.diagnosis.evaluation.search_control import SearchStoppedError
 from bench.diagnosis.fitting.fitted_models import FittedModel
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.alternative_causes import (
     list_competing_models,
-    list_submodels,
     refine_best_model,
     select_decisive,
 )
@@ -28,18 +25,14 @@ from bench.diagnosis.search.effect_search import (
     EffectSearch,
     select_by_size,
 )
-from sims.core.simulator import Array
+from bench.diagnosis.search.scored_models import list_submodels
+from bench.logs.sample_thinning import keeps_samples, take_every_nth
 from sims.recording.recording import Run
 
 MIN_SAMPLES_TO_THIN = 5_000
 """Minimum total number of samples of all runs for which they are thinned."""
 MIN_THINNED_SAMPLES = 2_000
 """Minimum total number of samples after thinning."""
-MIN_CHANNEL_SAMPLE_SHARE = 0.5
-"""Minimum number of samples of a channel after thinning, as a share of the expected number.
-
-A channel that is sampled rarely might otherwise lose all its samples.
-"""
 
 
 def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
@@ -61,10 +54,10 @@ def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
     if total < MIN_SAMPLES_TO_THIN or max(factors) < 2:
         return None
     runs = [
-        _take_every_nth(run, factor) for run, factor in zip(evaluator.runs, factors, strict=True)
+        take_every_nth(run, factor) for run, factor in zip(evaluator.runs, factors, strict=True)
     ]
     if not all(
-        _keeps_samples(thinned_run, run, factor)
+        keeps_samples(thinned_run, run, factor)
         for thinned_run, run, factor in zip(runs, evaluator.runs, factors, strict=True)
     ):
         return None
@@ -78,62 +71,6 @@ def _compute_factor(run: Run) -> int:
         return 1
     # The small addend keeps rounding from reducing a whole number of intervals by one.
     return max(int(MAX_TIME_STEP / float(np.median(intervals)) + 1e-6), 1)
-
-
-def _take_every_nth(run: Run, factor: int) -> Run:
-    """Return the run with every n-th sample of its channels; n is `factor`.
-
-    An input becomes its mean between the kept samples, so that it has the same effect. Columns that
-    are neither channels nor inputs (`extra`) are left out.
-    """
-    kept = np.arange(0, run.times.size, factor)
-    return replace(
-        run,
-        times=run.times[kept],
-        channels={name: values[kept] for name, values in run.channels.items()},
-        inputs={
-            name: _average_input(run.times, values, kept) for name, values in run.inputs.items()
-        },
-        extra={},
-    )
-
-
-def _average_input(times: Array, values: Array, kept: Indices) -> Array:
-    """Return the mean (K,) of an input over the samples from each kept sample to the next one.
-
-    Args:
-        times: (T,) sample times in seconds.
-        values: (T,) input, held from each sample to the next one.
-        kept: (K,) indices of the kept samples.
-
-    Returns:
-        Means, weighted by duration; after the last kept sample, the mean of the rest of the run.
-    """
-    durations = np.diff(times, append=times[-1])
-    # The last sample has no duration; a tiny one avoids 0 / 0 if it is a kept sample.
-    durations[-1] = 1e-9 * max(float(times[-1] - times[0]), 1e-9)
-    # `reduceat` sums from each kept sample to the next one, exclusive.
-    weighted_sums = np.add.reduceat(values * durations, kept)
-    means: Array = weighted_sums / np.add.reduceat(durations, kept)
-    return means
-
-
-def _keeps_samples(thinned_run: Run, run: Run, factor: int) -> bool:
-    """Return whether every channel keeps about its expected number of recorded samples.
-
-    A channel that is recorded at a lower rate than the others could lose nearly all its samples.
-
-    Args:
-        thinned_run: the run after subsampling.
-        run: the run before.
-        factor: every `factor`-th sample was kept.
-    """
-    for name, values in run.channels.items():
-        sample_count = int(np.isfinite(values).sum())
-        thinned_count = int(np.isfinite(thinned_run.channels[name]).sum())
-        if thinned_count < MIN_CHANNEL_SAMPLE_SHARE * sample_count / factor:
-            return False
-    return True
 
 
 MAX_SINGLE_EFFECT_REFITS = 6

@@ -27,7 +27,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_evaluator import Indices
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
 from sims.core.simulator import Array
 
 

@@ -21,7 +21,6 @@ doi:10.1093/biomet/73.1.13).
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -29,11 +28,13 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import NoiseModel, whiten
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
-from bench.diagnosis.fitting.levenberg_marquardt_step import (
-    compute_difference_steps,
+from bench.diagnosis.fitting.levenberg_marquardt import (
+    TrajectoryFit,
     compute_schur_complement,
     hold_known_states,
+)
+from bench.diagnosis.fitting.trajectory_derivatives import (
+    compute_central_jacobian,
 )
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from sims.core.simulator import Array
@@ -56,50 +57,6 @@ MIN_EIGENVALUE = 1e-12
 """Minimum eigenvalue of the scaled curvature; a direction with a smaller one is unidentified."""
 
 
-def compute_central_jacobian(
-    evaluator: RunEvaluator, fit: TrajectoryFit, noise: NoiseModel
-) -> TrajectoryFit:
-    """Compute the Jacobian of a fit by central differences.
-
-    One-sided differences suffice for the steps of a fit, but their curvature makes parameters look
-    distinguishable that are not.
-
-    Args:
-        evaluator: Run evaluator of the runs.
-        fit: Fit with a one-sided Jacobian.
-        noise: Noise that weights the channels.
-
-    Returns:
-        The fit with the new Jacobian.
-    """
-    parameter_count = fit.free_indices.size
-    bounds = _widen_bounds(evaluator, fit)
-    ranges = bounds[:, 1] - bounds[:, 0]
-    steps = compute_difference_steps(fit.jacobian, noise, ranges)
-    # Derivatives by initial states from a linearisation are no differences, so they are kept.
-    if evaluator.has_linearisation:
-        steps = steps[:parameter_count]
-    theta, states = _displace_both_sides(fit, steps, bounds)
-
-    # One call simulates both sides and all runs, because the engine steps a batch at once.
-    simulated = evaluator.simulate_all_runs(
-        theta.reshape(-1, fit.theta.size), states.reshape(-1, *fit.initial_states.shape)
-    )
-    lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
-
-    # A parameter at a bound moves by less than its step. Row j has changed parameter j, so the
-    # actual widths are on the diagonal of these (q, q) values of both sides.
-    lower, upper = theta[:, :parameter_count, fit.free_indices]
-    parameter_widths = np.diagonal(upper - lower)
-    widths = np.concatenate([parameter_widths, 2.0 * steps[parameter_count:]])
-    jacobian = np.moveaxis(upper_side - lower_side, 0, -1) / widths
-    # A simulation that failed on one side gives no slope.
-    jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
-    if evaluator.has_linearisation:
-        jacobian = np.concatenate([jacobian, fit.jacobian[..., parameter_count:]], axis=3)
-    return replace(fit, jacobian=jacobian)
-
-
 def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
     """Return the result of `compute_central_jacobian` for a fit; it is computed once and cached.
 
@@ -113,49 +70,6 @@ def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
         refined_fit = compute_central_jacobian(models.evaluator, fit, models.noise)
         models.refined_jacobians[id(fit)] = fit, refined_fit
     return refined_fit
-
-
-def _displace_both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array, Array]:
-    """Build the parameters (2, n, P) and initial states (2, n, R, s) of the central differences.
-
-    The first axis is the lower and the upper side. Row j of the second axis has number j of the n
-    parameters and initial states moved by its step (the initial state in all runs), and all others
-    unchanged. A row is simulated to get one column of the Jacobian.
-
-    Shapes: R runs, P parameters, s states of a run.
-
-    Args:
-        fit: the fit, with q free parameters.
-        steps: (n,) steps of the q parameters, then of the s initial states if they are moved too.
-        bounds: (q, 2) bounds of the parameters.
-    """
-    parameter_count = fit.free_indices.size
-    theta = np.tile(fit.theta, (2, len(steps), 1))
-    initial_states = np.tile(fit.initial_states, (2, len(steps), 1, 1))
-    for side, sign in enumerate((-1.0, 1.0)):
-        shifts = sign * steps
-        for j, index in enumerate(fit.free_indices):
-            # At a bound the step is one-sided; the caller divides by the actual difference.
-            theta[side, j, index] = np.clip(fit.theta[index] + shifts[j], *bounds[j])
-        for state_index, shift in enumerate(shifts[parameter_count:]):
-            initial_states[side, parameter_count + state_index, :, state_index] += shift
-    return theta, initial_states
-
-
-def _widen_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
-    """Return the bounds (q, 2) of the fitted parameters, widened to contain the fit.
-
-    Coefficients may be outside their plausible range.
-
-    Args:
-        evaluator: the runs, with the bounds of all parameters.
-        fit: the fit, with q free parameters.
-    """
-    values = fit.theta[fit.free_indices]
-    bounds = [evaluator.parameters[i].bounds for i in fit.free_indices]
-    # The shape is set explicitly because there may be no parameters.
-    low, high = np.array(bounds).reshape(-1, 2).T
-    return np.stack([np.minimum(low, values), np.maximum(high, values)], axis=1)
 
 
 def compute_covariance(models: ModelSet, model: FittedModel) -> Array:

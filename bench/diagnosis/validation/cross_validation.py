@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, KnownJacobian, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, KnownJacobian, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.validation.held_out_runs import (
     HeldOutFit,

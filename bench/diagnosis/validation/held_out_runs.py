@@ -17,11 +17,11 @@ import numpy as np
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, maximise_likelihood
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import count_identified_states
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from sims.core.plain_values import format_count
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
+from sims.core.user_messages import format_count
 
 HORIZON_STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
 """Stages of the fit of initial states: fraction of each run, and maximum number of steps."""
@@ -329,7 +329,7 @@ class HeldOutRuns(Validation):
             stages: share of the runs and maximum number of iterations, one after another.
         """
         # This import is needed for robots only.
-        from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+        from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
 
         nearest_fit = _find_lowest_cost_fit(fits)
         compute_state_jacobian(
@@ -352,36 +352,6 @@ class HeldOutRuns(Validation):
             self.evaluator.observed, fit.simulated, free_state_count
         )
         return HeldOutFit(fit.simulated, penalised_likelihood, fit.initial_states, free_state_count)
-
-
-def find_first_states(
-    evaluator: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit
-) -> FitStart | None:
-    """Return a start with better initial states of the fitted runs; None without better ones.
-
-    A fit may have stopped in a local minimum of the initial states. So these are fitted again with
-    the parameters of the fit, to ever longer parts of the runs, like those of held-out runs. They
-    must reduce the sum of squares by at least `MIN_SQUARES_DECREASE`. A robot on the ground keeps
-    its initial states, those with settled contacts.
-
-    Args:
-        evaluator: the fitted runs.
-        noise: noise that weights the channels.
-        fit: fit of these runs.
-    """
-    filtered_runs = evaluator.filtered_runs
-    if filtered_runs is not None and filtered_runs.is_on_ground:
-        return None
-    # The fit may replace these derivatives, which other fits of the runs use.
-    derivatives_before = evaluator.state_derivatives
-    runs = HeldOutRuns(evaluator, noise)
-    (prediction,) = runs.fit_initial_states([fit.theta], is_staged=True)
-    evaluator.state_derivatives = derivatives_before
-    squares = np.square((evaluator.observed - prediction.simulated) / noise.sigma)
-    # The comparison is negated because a failed prediction is NaN.
-    if not squares[runs.seen].sum() < fit.cost - MIN_SQUARES_DECREASE:
-        return None
-    return replace(fit.make_start(), initial_states=prediction.states)
 
 
 def compute_penalised_likelihood(observed: Array, simulated: Array, free: float) -> float:

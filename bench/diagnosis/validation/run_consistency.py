@@ -659,3 +659,25 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
     else:
         p_value = student_p_value(statistic, degrees_of_freedom)
     return Trend(slope, error, p_value, mean_square)
+
+
+def compute_prediction_half_widths(
+    consistencies: Sequence[ParameterConsistency],
+) -> dict[str, float]:
+    """Return half the prediction interval of each parameter for a new log, or else a new run.
+
+    Prediction intervals have the variation between logs (or runs) in them, in addition to the error
+    of the joint fit.
+
+    Args:
+        consistencies: Consistency of each parameter between runs, and between logs if there are
+            several.
+    """
+    # A new log is more general than a new run, so that it comes later and replaces it. Groups by a
+    # constant, such as a load, are not used.
+    return {
+        consistency.number: Z95 * consistency.prediction_sigma
+        for grouping in ("run", "log")
+        for consistency in consistencies
+        if consistency.by == grouping
+    }

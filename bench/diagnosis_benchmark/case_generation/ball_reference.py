@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import TrueSystem
 from bench.diagnosis_benchmark.case_generation.joint_reference import (
     SOLVER_TOLERANCES,
     compute_region_indicator,
 )
-from bench.diagnosis_benchmark.case_generation.reference_signals import TrueSystem
 from sims.core.simulator import Array, Scenario
 
 REST_SPEED = 1e-5  # m/s: after slower rebounds the ball rests

@@ -12,48 +12,33 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation import effect_coefficients, refitted_residuals
-from bench.diagnosis_benchmark.case_generation.recording_conditions import (
-    ANY_CONDITIONS,
+from bench.diagnosis_benchmark.case_generation.benchmark_case import (
     BenchmarkCase,
     RecordedCase,
-    RecordingConditions,
-    RequestedConditions,
-    draw_conditions,
     draw_size,
     make_case_rng,
     name_case,
 )
-from bench.diagnosis_benchmark.case_generation.reference_simulation import (
+from bench.diagnosis_benchmark.case_generation.effect_coefficients import find_coefficients
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    ANY_CONDITIONS,
     SIMULATORS,
-    UNMODELLED_CAUSES,
-    EffectCoefficients,
-    simulate_with_mujoco,
-    simulate_with_scipy,
+    RecordingConditions,
+    RequestedConditions,
+    draw_conditions,
 )
-from bench.diagnosis_benchmark.case_generation.strength_search import find_strength_for_size
+from bench.diagnosis_benchmark.case_generation.reference_simulation import (
+    UNMODELLED_CAUSES,
+    count_held_out_runs,
+    simulate_runs,
+)
+from bench.diagnosis_benchmark.case_generation.refitted_residuals import compute_unexplained_size
 from sims import effects as library
-from sims.core.simulator import Array
-from sims.recording.recording import Recording, Run
+from sims.recording.recording import Recording
 
 SYSTEMS = ("ball", "pendulum", "slider")
 SUBTHRESHOLD_SIZES = (0.1, 0.2, 0.3, 0.5)  # sizes for the power curve only
 
-SIMPLER_EFFECTS = {
-    "friction.direction": ("drag.linear",),
-    "friction.load_direction": ("friction.load",),
-    "friction.load_quadratic": ("friction.load",),
-    "friction.position": ("friction.coulomb",),
-    "friction.stribeck": ("friction.coulomb",),
-    "input.power": ("input.gain",),
-    "friction.warming": ("friction.coulomb", "drag.linear"),
-    "wind": (
-        "drag.linear",
-        "drag.quadratic",
-        "force.bias",
-        "gravity.tilt",
-    ),  # fast air is a steady push
-}
 
 EQUIVALENT_EFFECTS: tuple[tuple[str, bool, frozenset[str]], ...] = (
     ("slider", True, frozenset({"gravity.tilt", "force.bias", "input.bias"})),
@@ -155,13 +140,8 @@ def draw_case(
         hidden,
         target_size,
         lambda name: find_coefficients(name, fitted_setting, target_size, rng),
-        lambda effects: _compute_unexplained_size(kind, fitted_setting, effects, target_size),
+        lambda effects: compute_unexplained_size(kind, fitted_setting, effects, target_size),
     )
-
-
-def count_held_out_runs(case: BenchmarkCase) -> int:
-    """Return the number of held-out runs; they are the last runs of the recording."""
-    return max(1, case.runs // 3)
 
 
 @lru_cache(maxsize=16)
@@ -215,96 +195,6 @@ def _choose_hidden_causes(
     return first, str(rng.choice([name for name in names if name not in equivalent_effects]))
 
 
-def find_coefficients(
-    name: str, setting: RecordingConditions, target_size: float, rng: np.random.Generator
-) -> tuple[float, ...] | None:
-    """Find coefficients of a hidden cause at which the residual has the requested size.
-
-    Args:
-        name: name of the effect or unmodelled cause.
-        setting: recording conditions.
-        target_size: size in units of the noise.
-        rng: random generator for the shape of the cause.
-
-    Returns:
-        Coefficients, or None if no strength up to the maximum gives this size.
-    """
-    # The shape (sign, direction, period) is drawn; the strength that scales it is searched.
-    compute_coefficients = effect_coefficients.draw_effect_shape(name, setting, rng)
-    compute_residual = refitted_residuals.make_gap_function(
-        setting, lambda strength: _simulate_causes(setting, {name: compute_coefficients(strength)})
-    )
-    strength_and_size = find_strength_for_size(
-        compute_residual, target_size, effect_coefficients.get_max_strength(name)
-    )
-    if strength_and_size is None:
-        return None
-    strength, _ = strength_and_size
-    return compute_coefficients(strength)
-
-
-def _simulate_causes(setting: RecordingConditions, causes: EffectCoefficients) -> Array:
-    """Simulate noise-free observations (R, T, C) with hidden causes.
-
-    Unmodelled causes are simulated by scipy, because the batch engine does not know them.
-
-    Shapes: R runs, T samples, C channels.
-
-    Args:
-        setting: recording conditions.
-        causes: coefficients of the hidden causes by name.
-    """
-    if set(causes).isdisjoint(UNMODELLED_CAUSES[setting.system]):
-        return refitted_residuals.simulate_observations(setting, causes)
-    true_system = setting.make_true_system(causes)
-    return np.array(
-        [
-            simulate_with_scipy(true_system, scenario, setting.channels, run_index)
-            for run_index, scenario in enumerate(setting.scenarios)
-        ]
-    )
-
-
-def _compute_unexplained_size(
-    kind: str, setting: RecordingConditions, effects: EffectCoefficients, size: float
-) -> float | None:
-    """Compute the RMS residual that the best wrong answer leaves, in units of the noise.
-
-    It would be a correct answer if it left little. Wrong answers by kind of case:
-
-    * single: simpler forms of the effect, such as Coulomb friction for Stribeck friction,
-    * double: each of the two effects alone,
-    * foreign: the best effect of the library.
-
-    Args:
-        kind: single, double or foreign.
-        setting: recording conditions with the runs for fitting only.
-        effects: coefficients of the hidden causes by name.
-        size: size of each in units of the noise.
-
-    Returns:
-        The residual; 0 if the simulation with the causes diverges, so that the case is rejected;
-        None for a single effect that has no simpler form or is smaller than the noise.
-    """
-    # Effects with the coefficients from which their fit starts; None for several guesses.
-    wrong_answers = (
-        [(simpler, None) for name in effects for simpler in SIMPLER_EFFECTS.get(name, ())]
-        if kind == "single"
-        else list(effects.items())
-    )
-    if kind == "single" and (not wrong_answers or size < 1.0):
-        return None
-    observed = _simulate_causes(setting, effects)
-    if not np.isfinite(observed).all():
-        return 0.0
-    if kind == "foreign":
-        return refitted_residuals.compute_smallest_residual(setting, observed)
-    return min(
-        refitted_residuals.compute_refitted_residual(setting, observed, name, coefficients)
-        for name, coefficients in wrong_answers
-    )
-
-
 def record_case(case: BenchmarkCase) -> RecordedCase:
     """Simulate the recording of a case, with sensor noise.
 
@@ -321,34 +211,6 @@ def record_case(case: BenchmarkCase) -> RecordedCase:
     noise = setting.noise.sigma if case.stated else {}
     # The recording of a slider states no constants.
     constants = {} if case.system == "slider" else setting.constants
-    runs = _simulate_runs(case, setting)
+    runs = simulate_runs(case, setting)
     recording = Recording(Path(), case.system, "", constants, noise, runs)
     return RecordedCase(recording, SIMULATORS[case.system].system)
-
-
-def _simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
-    """Simulate every run of a case, add sensor noise, and mark the last runs as held out.
-
-    Args:
-        case: the case; it states the simulator of the recording (`source`).
-        setting: its recording conditions, with all runs.
-
-    Returns:
-        The runs, named by their indices, with noisy channels and the inputs.
-    """
-    rng = make_case_rng(case.name, "noise")
-    first_held_out = case.runs - count_held_out_runs(case)
-    true_system, runs = setting.make_true_system(case.effects), []
-    for run_index, scenario in enumerate(setting.scenarios):
-        if case.source == "mujoco":
-            observed = simulate_with_mujoco(true_system, scenario, setting.channels)
-        else:
-            observed = simulate_with_scipy(true_system, scenario, setting.channels, run_index)
-        recorded = setting.noise.add_to(observed, rng)
-        channels = dict(zip(setting.channels, recorded.T, strict=True))
-        is_held_out = run_index >= first_held_out
-        # The recording states neither initial states nor constants of a run.
-        runs.append(
-            Run(str(run_index), scenario.times, channels, scenario.inputs, {}, {}, is_held_out)
-        )
-    return tuple(runs)

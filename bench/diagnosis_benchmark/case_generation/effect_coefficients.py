@@ -12,14 +12,20 @@ from functools import cached_property
 
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation import refitted_residuals
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     MAX_RUNS,
+    SIMULATORS,
     RecordingConditions,
 )
-from bench.diagnosis_benchmark.case_generation.reference_simulation import SIMULATORS
-from bench.diagnosis_benchmark.case_generation.refitted_residuals import simulate_observations
+from bench.diagnosis_benchmark.case_generation.reference_simulation import (
+    simulate_causes,
+    simulate_observations,
+)
+from bench.diagnosis_benchmark.case_generation.strength_search import find_strength_for_size
 from sims import effects as library
 from sims.core.simulator import Array
+from sims.systems.servo import Servo
 
 CoefficientFunction = Callable[[float], tuple[float, ...]]
 """Function from strength to coefficients."""
@@ -696,3 +702,49 @@ UNMODELLED_SAMPLERS: dict[tuple[bool, str], Callable[..., CoefficientFunction]] 
     (True, "wear"): _draw_changing_restitution,
     (True, "layer"): _draw_drag_layer,
 }
+
+
+def list_coefficient_names(system: str, name: str) -> list[str]:
+    """List the names of an effect's coefficients, in the order of the numbers in a case.
+
+    They may depend on the system, as the number of directions does; those of the robot arm arm2
+    do not.
+
+    Args:
+        system: name of the system, such as ``pendulum``.
+        name: name of the effect, with or without a place, as ``friction.coulomb@elbow``.
+    """
+    effect = library.get_effect(name.partition("@")[0])
+    if system == "arm2":
+        return [coefficient.name for coefficient in effect.coefficients]
+    system_model = Servo.system if system == "servo" else SIMULATORS[system].system
+    # `on` gives the coefficients that the effect has on this system.
+    return [coefficient.name for coefficient in effect.on(system_model)]
+
+
+def find_coefficients(
+    name: str, setting: RecordingConditions, target_size: float, rng: np.random.Generator
+) -> tuple[float, ...] | None:
+    """Find coefficients of a hidden cause at which the residual has the requested size.
+
+    Args:
+        name: name of the effect or unmodelled cause.
+        setting: recording conditions.
+        target_size: size in units of the noise.
+        rng: random generator for the shape of the cause.
+
+    Returns:
+        Coefficients, or None if no strength up to the maximum gives this size.
+    """
+    # The shape (sign, direction, period) is drawn; the strength that scales it is searched.
+    compute_coefficients = draw_effect_shape(name, setting, rng)
+    compute_residual = refitted_residuals.make_gap_function(
+        setting, lambda strength: simulate_causes(setting, {name: compute_coefficients(strength)})
+    )
+    strength_and_size = find_strength_for_size(
+        compute_residual, target_size, get_max_strength(name)
+    )
+    if strength_and_size is None:
+        return None
+    strength, _ = strength_and_size
+    return compute_coefficients(strength)

@@ -3,8 +3,8 @@
 The model has one coordinate, and events where dry friction stops it. Hidden-state effects add a
 driven mass or an internal state that no sensor shows.
 
-Every law is written here again in plain numbers, those of signals in `reference_signals`. Nothing
-is shared with the effect library, which the benchmark tests.
+Every law is written here again in plain numbers, those of signals in `input_and_sensor_effects`.
+Nothing is shared with the effect library, which the benchmark tests.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from bench.diagnosis_benchmark.case_generation.reference_signals import (
+from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import (
     InputSegment,
     TrueSystem,
     compute_applied_input,

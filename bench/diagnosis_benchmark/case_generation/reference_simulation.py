@@ -19,23 +19,29 @@ of the effects. The unmodelled causes, which the library does not contain, are:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import exp
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.diagnosis_benchmark.case_generation import ball_reference, joint_reference
-from bench.diagnosis_benchmark.case_generation.reference_signals import (
+from bench.diagnosis_benchmark.case_generation import (
+    ball_reference,
+    joint_reference,
+)
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase, make_case_rng
+from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import (
     SENSOR_EFFECTS,
     EffectCoefficients,
     TrueSystem,
+    apply_lag,
+    compute_read_times,
+)
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    SIMULATORS,
+    RecordingConditions,
 )
 from sims import effects as library
 from sims.core.simulator import Array, Scenario
-from sims.system_simulator import SystemSimulator
-from sims.systems.ball import Ball
-from sims.systems.pendulum import Pendulum
-from sims.systems.slider import Slider
+from sims.recording.recording import Run
 
 __all__ = [
     "CHANNELS",
@@ -43,16 +49,10 @@ __all__ = [
     "UNMODELLED_CAUSES",
     "EffectCoefficients",
     "TrueSystem",
-    "get_constants",
     "simulate_with_mujoco",
     "simulate_with_scipy",
 ]
 
-SIMULATORS: dict[str, type[SystemSimulator]] = {
-    "ball": Ball,
-    "pendulum": Pendulum,
-    "slider": Slider,
-}
 UNMODELLED_CAUSES = {
     "ball": ball_reference.UNMODELLED_CAUSES,
     "pendulum": joint_reference.UNMODELLED_CAUSES,
@@ -65,16 +65,6 @@ MUJOCO_STEP_SECONDS = (
 )
 HIDDEN_STATE_STEP = 2.5e-3
 """Step of the engine for effects with hidden states, s."""
-
-
-def get_constants(system: str, **changed: float) -> dict[str, float]:
-    """Return the constants of a system by name.
-
-    Args:
-        system: name of the system, such as ``pendulum``.
-        **changed: constants with other values.
-    """
-    return {c.name: c.value for c in SIMULATORS[system].constants} | changed
 
 
 def simulate_with_scipy(
@@ -94,7 +84,7 @@ def simulate_with_scipy(
     Returns:
         Readings, (T, C).
     """
-    instants = _compute_read_times(true_system.effects, scenario.times - scenario.times[0])
+    instants = compute_read_times(true_system.effects, scenario.times - scenario.times[0])
     grid, sample_indices = (
         _refine_time_grid(instants)
         if "sensor.lag" in true_system.effects
@@ -115,31 +105,8 @@ def simulate_with_scipy(
                 observed[:, read_column], coefficients, grid, scenario.times[0] + grid
             )
         elif name == "sensor.lag":
-            observed = _apply_lag(observed, grid, coefficients[0])
+            observed = apply_lag(observed, grid, coefficients[0])
     return observed[sample_indices]
-
-
-def _compute_read_times(effects: EffectCoefficients, times: Array) -> Array:
-    """Compute the times at which the sensors read the motion, with a delay and a wrong clock.
-
-    The effects act in their order. The motion is known from time 0 on: before it, a delayed sensor
-    shows the initial state.
-
-    Args:
-        effects: coefficients of the hidden effects by name.
-        times: sample times since the first sample, s, (T,).
-
-    Returns:
-        Times that do not decrease, at least 0, s, (T,).
-    """
-    instants = times
-    for name, coefficients in effects.items():
-        if name == "sensor.delay":
-            instants = instants - coefficients[0]
-        elif name == "clock.skew":
-            instants = instants * (1 + coefficients[0])
-    read_times: Array = np.maximum.accumulate(np.maximum(instants, 0.0))
-    return read_times
 
 
 def simulate_with_mujoco(
@@ -208,24 +175,75 @@ def _refine_time_grid(instants: Array) -> tuple[Array, NDArray[np.intp]]:
     return np.array(grid), np.array(sample_indices)
 
 
-def _apply_lag(values: Array, grid: Array, lag: float) -> Array:
-    """Apply a first-order sensor lag: solve y' = (x - y) / lag.
+def count_held_out_runs(case: BenchmarkCase) -> int:
+    """Return the number of held-out runs; they are the last runs of the recording."""
+    return max(1, case.runs // 3)
 
-    The solution is exact for readings x that are linear between grid points.
+
+def simulate_causes(setting: RecordingConditions, causes: EffectCoefficients) -> Array:
+    """Simulate noise-free observations (R, T, C) with hidden causes.
+
+    Unmodelled causes are simulated by scipy, because the batch engine does not know them.
+
+    Shapes: R runs, T samples, C channels.
 
     Args:
-        values: readings x of C channels without lag at G grid points, (G, C).
-        grid: times, s, (G,).
-        lag: time constant, s.
+        setting: recording conditions.
+        causes: coefficients of the hidden causes by name.
+    """
+    if set(causes).isdisjoint(UNMODELLED_CAUSES[setting.system]):
+        return simulate_observations(setting, causes)
+    true_system = setting.make_true_system(causes)
+    return np.array(
+        [
+            simulate_with_scipy(true_system, scenario, setting.channels, run_index)
+            for run_index, scenario in enumerate(setting.scenarios)
+        ]
+    )
+
+
+def simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
+    """Simulate every run of a case, add sensor noise, and mark the last runs as held out.
+
+    Args:
+        case: the case; it states the simulator of the recording (`source`).
+        setting: its recording conditions, with all runs.
 
     Returns:
-        Lagging readings y, (G, C); at the first grid point y = x.
+        The runs, named by their indices, with noisy channels and the inputs.
     """
-    lagged, y = values.copy(), values[0].copy()
-    for sample, step in enumerate(np.diff(grid).tolist()):
-        slope = (values[sample + 1] - values[sample]) / step
-        # On a line, the lagging reading ends up `lag` seconds behind it.
-        particular_solution = values[sample] - slope * lag
-        y = particular_solution + slope * step + (y - particular_solution) * exp(-step / lag)
-        lagged[sample + 1] = y
-    return lagged
+    rng = make_case_rng(case.name, "noise")
+    first_held_out = case.runs - count_held_out_runs(case)
+    true_system, runs = setting.make_true_system(case.effects), []
+    for run_index, scenario in enumerate(setting.scenarios):
+        if case.source == "mujoco":
+            observed = simulate_with_mujoco(true_system, scenario, setting.channels)
+        else:
+            observed = simulate_with_scipy(true_system, scenario, setting.channels, run_index)
+        recorded = setting.noise.add_to(observed, rng)
+        channels = dict(zip(setting.channels, recorded.T, strict=True))
+        is_held_out = run_index >= first_held_out
+        # The recording states neither initial states nor constants of a run.
+        runs.append(
+            Run(str(run_index), scenario.times, channels, scenario.inputs, {}, {}, is_held_out)
+        )
+    return tuple(runs)
+
+
+def simulate_observations(setting: RecordingConditions, effects: EffectCoefficients) -> Array:
+    """Simulate noise-free observations (R, T, C) with given effects by the batch engine.
+
+    Shapes: R runs, T samples, C channels.
+
+    Args:
+        setting: recording conditions with the true base parameters and the runs.
+        effects: coefficients of the effects by name; empty for none.
+    """
+    kind = SIMULATORS[setting.system]
+    fixed_effects = {name: list(c) for name, c in effects.items()}
+    simulator = kind(setting.constants, setting.channels, engine="batch", fixed=fixed_effects)
+    # One row of base parameters for each run.
+    theta = np.array(
+        [[setting.parameters[p.name] for p in kind.system.parameters]] * len(setting.scenarios)
+    )
+    return simulator.simulate_batch(theta, setting.scenarios)

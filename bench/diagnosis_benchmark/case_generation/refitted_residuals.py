@@ -16,10 +16,13 @@ from itertools import product
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.recording_conditions import RecordingConditions
-from bench.diagnosis_benchmark.case_generation.reference_simulation import (
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     SIMULATORS,
+    RecordingConditions,
+)
+from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     EffectCoefficients,
+    simulate_causes,
 )
 from bench.diagnosis_benchmark.case_generation.strength_search import arrange_slopes
 from sims import effects as library
@@ -48,6 +51,22 @@ STOP_STIFFNESS_SHARES = (0.001, 0.01, 0.1)
 """Stiffnesses of an end stop from which its fit starts, as shares of the largest one."""
 STOP_LOSS = 0.05
 """Damping of an end stop from which its fit starts, as a factor of the approach velocity, s/m."""
+
+SIMPLER_EFFECTS = {
+    "friction.direction": ("drag.linear",),
+    "friction.load_direction": ("friction.load",),
+    "friction.load_quadratic": ("friction.load",),
+    "friction.position": ("friction.coulomb",),
+    "friction.stribeck": ("friction.coulomb",),
+    "input.power": ("input.gain",),
+    "friction.warming": ("friction.coulomb", "drag.linear"),
+    "wind": (
+        "drag.linear",
+        "drag.quadratic",
+        "force.bias",
+        "gravity.tilt",
+    ),  # fast air is a steady push
+}
 
 
 @dataclass(frozen=True)
@@ -216,25 +235,6 @@ class NuisanceFitter:
             residual.ravel() if is_finite else np.full(residual.size, np.inf),
             arrange_slopes(slopes, count),
         )
-
-
-def simulate_observations(setting: RecordingConditions, effects: EffectCoefficients) -> Array:
-    """Simulate noise-free observations (R, T, C) with given effects by the batch engine.
-
-    Shapes: R runs, T samples, C channels.
-
-    Args:
-        setting: recording conditions with the true base parameters and the runs.
-        effects: coefficients of the effects by name; empty for none.
-    """
-    kind = SIMULATORS[setting.system]
-    fixed_effects = {name: list(c) for name, c in effects.items()}
-    simulator = kind(setting.constants, setting.channels, engine="batch", fixed=fixed_effects)
-    # One row of base parameters for each run.
-    theta = np.array(
-        [[setting.parameters[p.name] for p in kind.system.parameters]] * len(setting.scenarios)
-    )
-    return simulator.simulate_batch(theta, setting.scenarios)
 
 
 def make_gap_function(
@@ -477,3 +477,43 @@ def _estimate_linear_step(
     step = fit.compute_step(residual, slope, damping=1e-9)
     theta[:fitted_count] += step[:fitted_count] * fit.scales[:fitted_count]
     return compute_rms(residual - slope @ step), np.clip(theta, fit.low, fit.high)
+
+
+def compute_unexplained_size(
+    kind: str, setting: RecordingConditions, effects: EffectCoefficients, size: float
+) -> float | None:
+    """Compute the RMS residual that the best wrong answer leaves, in units of the noise.
+
+    It would be a correct answer if it left little. Wrong answers by kind of case:
+
+    * single: simpler forms of the effect, such as Coulomb friction for Stribeck friction,
+    * double: each of the two effects alone,
+    * foreign: the best effect of the library.
+
+    Args:
+        kind: single, double or foreign.
+        setting: recording conditions with the runs for fitting only.
+        effects: coefficients of the hidden causes by name.
+        size: size of each in units of the noise.
+
+    Returns:
+        The residual; 0 if the simulation with the causes diverges, so that the case is rejected;
+        None for a single effect that has no simpler form or is smaller than the noise.
+    """
+    # Effects with the coefficients from which their fit starts; None for several guesses.
+    wrong_answers = (
+        [(simpler, None) for name in effects for simpler in SIMPLER_EFFECTS.get(name, ())]
+        if kind == "single"
+        else list(effects.items())
+    )
+    if kind == "single" and (not wrong_answers or size < 1.0):
+        return None
+    observed = simulate_causes(setting, effects)
+    if not np.isfinite(observed).all():
+        return 0.0
+    if kind == "foreign":
+        return compute_smallest_residual(setting, observed)
+    return min(
+        compute_refitted_residual(setting, observed, name, coefficients)
+        for name, coefficients in wrong_answers
+    )

@@ -23,7 +23,7 @@ import numpy as np
 
 from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase, NamedCause
 from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import (
     EffectColumn,

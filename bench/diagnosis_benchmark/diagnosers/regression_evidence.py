@@ -33,7 +33,7 @@ from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import BaseFit, fit_base_model
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot

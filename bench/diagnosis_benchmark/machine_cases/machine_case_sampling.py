@@ -10,22 +10,24 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.recording_conditions import (
-    ANY_CONDITIONS,
+from bench.diagnosis_benchmark.case_generation.benchmark_case import (
     BenchmarkCase,
     RecordedCase,
-    RequestedConditions,
     draw_size,
     make_case_rng,
     name_case,
 )
-from bench.diagnosis_benchmark.machine_cases import hidden_causes
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    ANY_CONDITIONS,
+    RequestedConditions,
+)
+from bench.diagnosis_benchmark.machine_cases import machine_effect_coefficients
 from bench.diagnosis_benchmark.machine_cases.arm_model_file import (
     MODEL_FILE_NAME,
     render_arm_mjcf,
 )
-from bench.diagnosis_benchmark.machine_cases.hidden_causes import EFFECTS_BY_MACHINE
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES
+from bench.diagnosis_benchmark.machine_cases.machine_effect_coefficients import EFFECTS_BY_MACHINE
 from bench.diagnosis_benchmark.machine_cases.machine_effect_sizing import (
     compute_unexplained_size,
     find_sized_coefficients,
@@ -140,12 +142,16 @@ def _choose_hidden_causes(
     if kind == "clean":
         return ()
     is_foreign = kind == "foreign"
-    causes = hidden_causes.UNMODELLED_CAUSES if is_foreign else EFFECTS_BY_MACHINE[system]
-    first_candidates = hidden_causes.list_effect_places(system, effect or str(rng.choice(causes)))
+    causes = (
+        machine_effect_coefficients.UNMODELLED_CAUSES if is_foreign else EFFECTS_BY_MACHINE[system]
+    )
+    first_candidates = machine_effect_coefficients.list_effect_places(
+        system, effect or str(rng.choice(causes))
+    )
     first = str(rng.choice(first_candidates))
     if kind != "double":
         return (first,)
-    candidates = hidden_causes.list_effect_places(system, str(rng.choice(causes)))
+    candidates = machine_effect_coefficients.list_effect_places(system, str(rng.choice(causes)))
     candidates = tuple(name for name in candidates if name != first)
     # Without another candidate it is the first effect again, which is equivalent to itself.
     second = str(rng.choice(candidates)) if candidates else first

@@ -14,9 +14,9 @@ from bench.diagnosis_benchmark.case_generation.strength_search import (
     compute_orthonormal_basis,
     find_strength_for_size,
 )
-from bench.diagnosis_benchmark.machine_cases import hidden_causes
-from bench.diagnosis_benchmark.machine_cases.hidden_causes import EFFECTS_BY_MACHINE
+from bench.diagnosis_benchmark.machine_cases import machine_effect_coefficients
 from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES, Effects
+from bench.diagnosis_benchmark.machine_cases.machine_effect_coefficients import EFFECTS_BY_MACHINE
 from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import (
     MachineRecordingConditions,
 )
@@ -55,7 +55,7 @@ def find_sized_coefficients(
     Returns:
         The coefficients; None if the size is not reached.
     """
-    compute_coefficients = hidden_causes.draw_effect_shape(name, conditions, rng)
+    compute_coefficients = machine_effect_coefficients.draw_effect_shape(name, conditions, rng)
     gauge = _ResidualGauge(conditions)
 
     def compute_size(strength: float) -> float:
@@ -101,7 +101,7 @@ def compute_unexplained_size(
     base_readings = conditions.simulate_readings({}, coarse=_COARSE_STEP_FACTOR)
     residual_sizes = []
     for name in wrong_answers:
-        compute_coefficients = hidden_causes.draw_effect_shape(name, conditions, rng)
+        compute_coefficients = machine_effect_coefficients.draw_effect_shape(name, conditions, rng)
         # One of two hidden effects has known coefficients; of others, the shape is drawn.
         probe = {name: effects.get(name, compute_coefficients(_PROBE_STRENGTH))}
         direction = conditions.simulate_readings(probe, coarse=_COARSE_STEP_FACTOR) - base_readings
@@ -127,7 +127,7 @@ def _list_wrong_answers(kind: str, system: str, effects: Effects) -> list[str]:
         return [
             name
             for effect in EFFECTS_BY_MACHINE[system]
-            for name in hidden_causes.list_effect_places(system, effect)
+            for name in machine_effect_coefficients.list_effect_places(system, effect)
         ]
     (hidden_effect,) = effects
     effect, at, place = hidden_effect.partition("@")

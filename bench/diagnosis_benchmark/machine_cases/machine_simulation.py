@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.reference_signals import (
+from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import (
     SENSOR_EFFECTS,
     STEPWISE_INPUT_EFFECTS,
 )

@@ -15,7 +15,7 @@ import numpy as np
 
 from sims.core.simulator import Array
 from sims.recording.log_formats.unit_names import read_unit, split_unit
-from sims.recording.log_joining import MAX_REPEATED
+from sims.recording.log_time_alignment import MAX_REPEATED
 from sims.robot.robot_model import Joint
 
 Role = Literal["command", "position", "velocity", "force", "other"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bench.core.options import option
+from bench.core.option_dataclasses import option
 from bench.logs.importing.column_guessing import LogColumn
 from sims.core.argument_checks import Name, Names
 

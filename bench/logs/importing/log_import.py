@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
+from bench.core.option_dataclasses import takes_options
 from bench.logs.importing.description_writer import DescriptionWriter
 from bench.logs.importing.import_result import POSITION_UNITS, ImportOptions, ImportResult
 from bench.logs.importing.joint_order import assign_order
@@ -17,10 +20,17 @@ from bench.logs.importing.signal_assignment import (
     assign_velocities,
 )
 from bench.logs.recording_loading import load_recording
-from sims.core.files import write_files
+from sims.core.argument_checks import Expected
+from sims.core.files import check_absent, write_files
 from sims.core.simulator import InputError
 from sims.core.toml_validation import check_known_names
+from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_model import RobotModel
+
+Logs: TypeAlias = Annotated[
+    str | Path | Sequence[str | Path], Expected("the path of a log, or a list of paths")
+]
+"""Files of one run, or folders with the files of one run each."""
 
 
 def describe_logs(
@@ -93,3 +103,44 @@ def write_checked_description(path: Path, text: str) -> None:
     except BaseException:  # also if the user interrupts the reading
         path.unlink()
         raise
+
+
+@dataclass(frozen=True)
+class ImportRequest(ImportOptions):
+    """Logs to be described, with what the user states about them.
+
+    Attributes:
+        logs: Files of one run, or folders with the files of one run each.
+        model: Model file of the robot, MJCF or URDF.
+        out: Path NAME.toml of a new file.
+    """
+
+    logs: Logs
+    model: str | Path
+    out: str | Path
+
+
+@takes_options(ImportRequest)
+def import_logs(options: ImportRequest) -> ImportResult:
+    """Write a description (TOML) of a robot's raw logs, so that all commands can read them.
+
+    Args:
+        options: Arguments, the attributes of `ImportRequest` and, by name, those of
+            `bench.logs.importing.import_result.ImportOptions`.
+
+    Returns:
+        The guesses, the columns that were left out, and what to check.
+
+    Raises:
+        InputError: The logs cannot be read or contain nothing of the robot; the message is one
+            line, and nothing is written.
+    """
+    logs = [options.logs] if isinstance(options.logs, str | Path) else options.logs
+    model, path = Path(options.model), Path(options.out)
+    if path.suffix != ".toml":
+        raise InputError(f"expected a description to write, NAME.toml, found '{path}'")
+    check_absent([path])
+    paths = [Path(log) for log in logs]
+    result = describe_logs(paths, read_robot(model), model, path.parent, options)
+    write_checked_description(path, result.text)
+    return result

@@ -30,7 +30,7 @@ from bench.logs.quality.velocity_checks import MIN_CORRELATION, VelocityComparis
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, InputError
 from sims.recording.recording import Run
-from sims.recording.unit_conversion import compute_unit_scale
+from sims.recording.unit_conversion import compute_unit_scale, is_convertible
 from sims.robot.robot_model import Actuator, Joint, RobotModel
 
 
@@ -201,20 +201,6 @@ class SignalAssignment:
             if self.get_joint(name) == joint:
                 return signal.column.bare
         return ""
-
-
-def is_convertible(unit: str, target: str) -> bool:
-    """Return whether a unit converts to another one.
-
-    Args:
-        unit: name of the unit; an empty one does not convert.
-        target: name of the other unit.
-    """
-    try:
-        compute_unit_scale(unit, target)
-    except InputError:
-        return False
-    return bool(unit)
 
 
 SLOPE_RANGE = (0.7, 1.4)

@@ -38,11 +38,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.logs.lost_samples import MAX_FILLED_SAMPLES, find_lost_samples
-from bench.logs.quality import pose_check
 from bench.logs.quality.quality_finding import SIGNIFICANCE_SIGMAS, Anomaly, QualityFinding
-from sims.core.plain_values import join_first_names
 from sims.core.simulator import Array, Simulator
 from sims.core.system import StateSnapshot, System
+from sims.core.user_messages import join_first_names
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
 
@@ -50,11 +49,6 @@ JITTER_THRESHOLD = 0.02
 """Smallest jitter that is reported, 1 sigma, as a fraction of the sampling interval."""
 LOST_SAMPLE_SHARE_THRESHOLD = 0.002
 """Smallest share of lost or repeated samples that is reported."""
-FAST_SIGNAL_STEPS = 5.0
-"""Smallest change of a signal per sample that counts as fast motion, in quantisation steps.
-
-A signal that changes this fast does not repeat its value by coincidence.
-"""
 UNEVEN_SHARE = 0.01
 """Relative difference from the median interval from which an interval counts as uneven."""
 
@@ -142,83 +136,6 @@ def _compute_uneven_share(times: Array) -> float:
     return float(np.mean(np.abs(steps - median_step) > UNEVEN_SHARE * median_step))
 
 
-def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
-    """Find samples that repeat the previous one in every channel although the system moves.
-
-    Such samples were not measured anew, and look like a delay. A run counts if it has significantly
-    more of them than its quantisation causes by coincidence.
-
-    Args:
-        recording: Recording to check.
-    """
-    repeated_count, sample_count, runs = 0, 0, []
-    for run in recording.runs:
-        count, expected = _count_stale_samples(run)
-        # A count of independent events has the standard deviation sqrt(expected) (Poisson).
-        if count > expected + SIGNIFICANCE_SIGMAS * np.sqrt(max(expected, 1.0)):
-            repeated_count += count
-            runs.append(run.name)
-        sample_count += run.times.size
-    if repeated_count > LOST_SAMPLE_SHARE_THRESHOLD * sample_count:
-        yield QualityFinding(
-            "clock",
-            f"{repeated_count} samples ({repeated_count / sample_count:.1%}) repeat the one before "
-            f"in every channel while it moves, in {join_first_names(runs)}",
-            "leave these rows out: a value that is one interval old looks like a delay",
-        )
-
-
-def _count_stale_samples(run: Run) -> tuple[int, float]:
-    """Count samples that repeat the previous one in every channel although the system moves fast.
-
-    The system moves fast at a sample if some channel changes by at least `FAST_SIGNAL_STEPS`
-    quantisation steps directly before or after it. Such a repetition is rarely a coincidence.
-
-    Args:
-        run: recorded run with its channels.
-
-    Returns:
-        The count, and the count to expect by coincidence, from the noise alone. It is estimated
-        from the samples that change by one step at most: with N channels, each of which changes by
-        -1, 0 or 1 step with equal probability, one in 3^N of them repeats everything.
-    """
-    signals = [values for values in run.channels.values() if np.isfinite(values).sum() > 3]
-    if not signals or run.times.size < 4:
-        return 0, 0.0
-    # (N, T - 1) changes of the channels; NaN where a sample is missing.
-    changes = np.array([_count_quantisation_steps(values) for values in signals])
-    neighbour_changes = np.maximum(np.abs(changes[:, :-2]), np.abs(changes[:, 2:]))
-    is_moving = (
-        np.nan_to_num(np.max(neighbour_changes, axis=0, initial=0.0), nan=0.0) >= FAST_SIGNAL_STEPS
-    )
-    # A missing sample may be a repetition, but does not count as a change by one step.
-    is_unchanged = (np.nan_to_num(changes, nan=0.0) == 0).all(axis=0)
-    is_stale = is_unchanged[1:-1] & is_moving
-    is_nearly_unchanged = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)
-    is_nearly_stale = is_nearly_unchanged[1:-1] & is_moving
-    # Of the changes by one step at most, one in 3^N is a repetition: 1 / (3^N - 1) of the others.
-    one_step_count = int(is_nearly_stale.sum()) - int(is_stale.sum())
-    return int(is_stale.sum()), one_step_count / max(3.0 ** len(signals) - 1.0, 1.0)
-
-
-def _count_quantisation_steps(values: Array) -> Array:
-    """Return the (T - 1,) changes of a signal in units of its smallest change, rounded.
-
-    The smallest change of a quantised signal is its quantisation step. Changes by rounding errors
-    do not count.
-
-    Args:
-        values: (T,) samples, NaN where missing.
-    """
-    changes = np.diff(values)
-    sizes = np.abs(changes[np.isfinite(changes)])
-    nonzero_sizes = sizes[sizes > 1e-9 * np.max(sizes, initial=0.0)]
-    if not nonzero_sizes.size:
-        return np.zeros_like(changes)
-    # Without quantisation the smallest change is tiny, so that any motion is many steps.
-    return np.asarray(np.round(changes / nonzero_sizes.min()), dtype=np.float64)
-
-
 TIME_UNIT_RATIO_THRESHOLD = 300.0
 """Ratio of the two times (1) and (2) above which a unit is wrong."""
 DRIVEN_SYSTEM_FACTOR = 10.0
@@ -301,7 +218,7 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     system = kind.system()
     interval = float(np.median(np.diff(run.times)))
     if kind.has_model:
-        accelerations = pose_check.compute_static_accelerations(run, kind)
+        accelerations = compute_static_accelerations(run, kind)
     else:
         accelerations = _compute_rest_accelerations(recording, run, system)
     # A servo holds its position by force, so large forces at rest are normal.
@@ -645,3 +562,32 @@ def _pool_estimates(estimates: list[_Estimate]) -> _Estimate:
         reduced_chi_squared = float(weights @ (drifts - drift) ** 2) / (len(estimates) - 1)
         error *= max(reduced_chi_squared, 1.0) ** 0.5
     return _Estimate(drift, error)
+
+
+def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
+    """Compute accelerations of a robot at rest in recorded positions under recorded commands.
+
+    They show how fast the robot could move, by which time stamps in a wrong unit are found.
+
+    Args:
+        run: Run of the robot.
+        kind: Simulator class of the robot.
+
+    Returns:
+        (N, D) accelerations of the D joints with one coordinate, at N times of the run, at most
+        `CHECKED_INSTANTS`.
+    """
+    # This import is needed for robots only.
+    from sims.robot.contact_pairs import iterate_poses
+
+    joints = [
+        joint
+        for joint in kind.robot.joints  # type: ignore[attr-defined]
+        if joint.has_one_coordinate
+    ]
+    return np.array(
+        [
+            [data.qacc[joint.velocity] for joint in joints]
+            for data in iterate_poses(kind, run.channels, run.inputs)
+        ]
+    )

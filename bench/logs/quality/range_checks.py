@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.logs.quality.quality_finding import Anomaly
-from sims.core.simulator import Simulator
+from sims.core.number_limits import MAX_NUMBER
+from sims.core.simulator import InputError, Simulator
 from sims.recording.recording import Recording
 
 if TYPE_CHECKING:  # A recording without a robot needs no model.
@@ -162,3 +163,20 @@ def _format_exceeded_range(
         yield f"{name} ranges from {min_value:.4g} to {max_value:.4g} {unit}".rstrip() + (
             f" in runs {run_names}, and {states}: another unit, sign or zero?"
         )
+
+
+def check_value_sizes(recording: Recording) -> None:
+    """Reject values that are so large that sums of their squares may overflow.
+
+    Args:
+        recording: Recording to check; missing values (NaN) are ignored.
+
+    Raises:
+        InputError: A value of a channel or input exceeds `MAX_NUMBER`; the message is one line.
+    """
+    for run in recording.runs:
+        for name, values in (*run.channels.items(), *run.inputs.items()):
+            largest = float(np.nanmax(np.abs(values), initial=0.0))
+            if largest > MAX_NUMBER:
+                problem = f"expected values within ±{MAX_NUMBER:g}, found {largest:.3g}"
+                raise InputError(f"{recording.path}: run {run.name}, column {name}: {problem}")

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from bench.logs.quality.noise_estimation import estimate_noise
-from bench.logs.quality.quality_finding import QualityFinding
-from sims.core.plain_values import append_unit, join_first_names
+from bench.logs.quality.clock_checks import LOST_SAMPLE_SHARE_THRESHOLD
+from bench.logs.quality.quality_finding import SIGNIFICANCE_SIGMAS, QualityFinding
+from sims.core.noise_estimation import estimate_noise
 from sims.core.simulator import Array, Channel, Simulator
-from sims.recording.recording import Recording
+from sims.core.user_messages import append_unit, join_first_names
+from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
 
 QUANTISATION_SHARE_THRESHOLD = 0.02
@@ -30,6 +31,12 @@ MOTION_THRESHOLD_SIGMAS = 6.0
 """Smallest range within a window that counts as motion, in standard deviations of noise.
 
 Noise alone has a range of 3.7 standard deviations on average.
+"""
+
+FAST_SIGNAL_STEPS = 5.0
+"""Smallest change of a signal per sample that counts as fast motion, in quantisation steps.
+
+A signal that changes this fast does not repeat its value by coincidence.
 """
 
 
@@ -255,3 +262,80 @@ def _find_moving_windows(values: Array, min_motion: float) -> Array:
     windows = windows[np.isfinite(windows).any(axis=1)]
     is_moving: Array = (np.nanmax(windows, axis=1) - np.nanmin(windows, axis=1)) > min_motion
     return is_moving
+
+
+def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
+    """Find samples that repeat the previous one in every channel although the system moves.
+
+    Such samples were not measured anew, and look like a delay. A run counts if it has significantly
+    more of them than its quantisation causes by coincidence.
+
+    Args:
+        recording: Recording to check.
+    """
+    repeated_count, sample_count, runs = 0, 0, []
+    for run in recording.runs:
+        count, expected = _count_stale_samples(run)
+        # A count of independent events has the standard deviation sqrt(expected) (Poisson).
+        if count > expected + SIGNIFICANCE_SIGMAS * np.sqrt(max(expected, 1.0)):
+            repeated_count += count
+            runs.append(run.name)
+        sample_count += run.times.size
+    if repeated_count > LOST_SAMPLE_SHARE_THRESHOLD * sample_count:
+        yield QualityFinding(
+            "clock",
+            f"{repeated_count} samples ({repeated_count / sample_count:.1%}) repeat the one before "
+            f"in every channel while it moves, in {join_first_names(runs)}",
+            "leave these rows out: a value that is one interval old looks like a delay",
+        )
+
+
+def _count_stale_samples(run: Run) -> tuple[int, float]:
+    """Count samples that repeat the previous one in every channel although the system moves fast.
+
+    The system moves fast at a sample if some channel changes by at least `FAST_SIGNAL_STEPS`
+    quantisation steps directly before or after it. Such a repetition is rarely a coincidence.
+
+    Args:
+        run: recorded run with its channels.
+
+    Returns:
+        The count, and the count to expect by coincidence, from the noise alone. It is estimated
+        from the samples that change by one step at most: with N channels, each of which changes by
+        -1, 0 or 1 step with equal probability, one in 3^N of them repeats everything.
+    """
+    signals = [values for values in run.channels.values() if np.isfinite(values).sum() > 3]
+    if not signals or run.times.size < 4:
+        return 0, 0.0
+    # (N, T - 1) changes of the channels; NaN where a sample is missing.
+    changes = np.array([_count_quantisation_steps(values) for values in signals])
+    neighbour_changes = np.maximum(np.abs(changes[:, :-2]), np.abs(changes[:, 2:]))
+    is_moving = (
+        np.nan_to_num(np.max(neighbour_changes, axis=0, initial=0.0), nan=0.0) >= FAST_SIGNAL_STEPS
+    )
+    # A missing sample may be a repetition, but does not count as a change by one step.
+    is_unchanged = (np.nan_to_num(changes, nan=0.0) == 0).all(axis=0)
+    is_stale = is_unchanged[1:-1] & is_moving
+    is_nearly_unchanged = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)
+    is_nearly_stale = is_nearly_unchanged[1:-1] & is_moving
+    # Of the changes by one step at most, one in 3^N is a repetition: 1 / (3^N - 1) of the others.
+    one_step_count = int(is_nearly_stale.sum()) - int(is_stale.sum())
+    return int(is_stale.sum()), one_step_count / max(3.0 ** len(signals) - 1.0, 1.0)
+
+
+def _count_quantisation_steps(values: Array) -> Array:
+    """Return the (T - 1,) changes of a signal in units of its smallest change, rounded.
+
+    The smallest change of a quantised signal is its quantisation step. Changes by rounding errors
+    do not count.
+
+    Args:
+        values: (T,) samples, NaN where missing.
+    """
+    changes = np.diff(values)
+    sizes = np.abs(changes[np.isfinite(changes)])
+    nonzero_sizes = sizes[sizes > 1e-9 * np.max(sizes, initial=0.0)]
+    if not nonzero_sizes.size:
+        return np.zeros_like(changes)
+    # Without quantisation the smallest change is tiny, so that any motion is many steps.
+    return np.asarray(np.round(changes / nonzero_sizes.min()), dtype=np.float64)

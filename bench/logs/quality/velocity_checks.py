@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.logs.quality.noise_estimation import estimate_noise
 from bench.logs.quality.quality_finding import SIGNIFICANCE_SIGMAS, QualityFinding
+from sims.core.noise_estimation import estimate_noise
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run

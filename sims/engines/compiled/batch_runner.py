@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from itertools import compress
+from typing import Any
 
 import numpy as np
 
@@ -17,14 +18,18 @@ from sims.engines.compiled.data_layout import (
     MIN_REMAINING_SHARE,
     RESTITUTION,
     BatchArrays,
+    Block,
+    BlockBuffers,
+    ProgramArrays,
     allocate_block,
+    check_block,
 )
+from sims.engines.compiled.element_stepping import COMPILED, step_elements
 from sims.engines.compiled.force_program import (
     ForceProgram,
     compute_own_inertia,
     get_force_program,
 )
-from sims.engines.compiled.kernel import COMPILED, integrate_elements
 from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS
 from sims.engines.time_grid import is_active
 
@@ -255,3 +260,27 @@ def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple
             elements_of.setdefault(pattern.tobytes(), []).append(element)
         groups = [np.array(members) for members in elements_of.values()]
     return [(members, list(compress(effects, patterns[members[0]]))) for members in groups]
+
+
+def integrate_elements(
+    program: ProgramArrays,
+    arrays: BatchArrays,
+    buffers: BlockBuffers,
+    w: int,
+) -> None:
+    """Integrate all elements of a batch.
+
+    Args:
+        program: program of the system and its effects.
+        arrays: batch of elements.
+        buffers: buffers of the slots, each of which holds one batch element at a time.
+        w: number of slots in use.
+
+    Raises:
+        ValueError: an array is not as specified.
+    """
+    # `Block` has its integers last, and `steps_per_record` is the last field of `arrays`.
+    fields: tuple[Any, ...] = *program, *arrays[:-1], *buffers, arrays.steps_per_record, w
+    block = Block(*fields)
+    check_block(block)
+    COMPILED.bind(step_elements, *block)()

@@ -1,8 +1,8 @@
 """Functions on arrays in machine code: loaded from the user's cache, or compiled once.
 
-numba translates the functions (`kernel_build`), which takes up to 20 s. The machine code is stored
-(`machine_code_cache`), and loaded with llvmlite alone (`machine_code`), in a few hundredths of a
-second and without numba.
+numba translates the functions (`numba_compilation`), which takes up to 20 s. The machine code is
+stored (`machine_code_cache`), and loaded with llvmlite alone (`machine_code`), in a few hundredths
+of a second and without numba.
 """
 
 from __future__ import annotations

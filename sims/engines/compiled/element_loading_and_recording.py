@@ -7,7 +7,6 @@ import numpy as np
 from sims.engines.compiled.data_layout import (
     DIMENSIONS,
     ELEMENT,
-    EVENT_COUNT,
     EVENT_DELAY,
     FIRST_VECTOR,
     FLOOR,
@@ -26,7 +25,6 @@ from sims.engines.compiled.data_layout import (
     STEP_COUNT,
     STEP_INDEX,
     STEP_LIMIT,
-    STEP_START,
     Block,
     T,
     V,
@@ -146,33 +144,6 @@ def record_state(block: Block, i: int, record: int) -> None:
         block.records[element, record, k] = a[X + k, i]
         block.records[element, record, d + k] = a[V + k, i]
         block.records[element, record, 2 * d + k] = a[K1 + k, i]
-
-
-def next_step(block: Block, i: int) -> None:
-    """Begin the next planned step of the element in slot i, with the inputs of that step.
-
-    A planned step is one of the batch's steps; it may be divided at events such as impacts. The
-    time is set to the sum of the planned steps, which removes the rounding of divided ones. After
-    the last planned step, the remaining time is zero.
-
-    Args:
-        block: force program, simulations (elements) of a batch, and their buffers. Each of the
-            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
-            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
-        i: index of the slot, the column of the batch element.
-    """
-    a = block.a
-    n = block.n
-    row = n[ELEMENT, i] if block.steps.shape[0] > 1 else 0
-    step = n[STEP_INDEX, i] + 1
-    n[STEP_INDEX, i] = step
-    n[IS_STEP_START, i] = 1
-    n[EVENT_COUNT, i] = 0
-    a[STEP_START, i] += block.steps[row, step - 1]
-    a[T, i] = a[STEP_START, i]
-    a[REMAINING_TIME, i] = block.steps[row, step] if step < block.steps.shape[1] else 0.0
-    set_inputs(block, i)
 
 
 def shift_time(block: Block, i: int, seconds: float) -> float:

@@ -22,15 +22,21 @@ the ripples of a fast motor) are rejected and shortened, and steps that contain 
 (`events`). The slot of a finished element is given to the next one, so that slots stay in use
 although elements need different numbers of steps. The result of an element does not depend on any
 other.
+
+Compiled functions of the batch engine: integration of a batch, and instructions on registers.
 """
 
 from __future__ import annotations
 
 from sims.engines.compiled.accelerations import begin_step, compute_acceleration, evaluate_forces
+from sims.engines.compiled.compiled_functions import CompiledFunctions
 from sims.engines.compiled.data_layout import (
+    BLOCK_SHAPES,
     BOUNCES,
     CONSTANTS,
     DIMENSIONS,
+    ELEMENT,
+    EVENT_COUNT,
     EVENT_DELAY,
     F1,
     HAS_FORCES,
@@ -40,6 +46,7 @@ from sims.engines.compiled.data_layout import (
     IN_X,
     IS_IDLE,
     IS_RESTING,
+    IS_STEP_START,
     K1,
     K2,
     K3,
@@ -51,7 +58,9 @@ from sims.engines.compiled.data_layout import (
     ORDER_INDEX,
     PENDING_EVENT,
     REMAINING_TIME,
+    STEP_INDEX,
     STEP_LIMIT,
+    STEP_START,
     Block,
     H,
     T,
@@ -60,12 +69,12 @@ from sims.engines.compiled.data_layout import (
 )
 from sims.engines.compiled.element_loading_and_recording import (
     load_element,
-    next_step,
     record_and_check_remaining,
+    set_inputs,
 )
 from sims.engines.compiled.events import detect_and_schedule_event, handle_event
 from sims.engines.compiled.ground_impacts import resolve_initial_ground_contact
-from sims.engines.compiled.interpreter import nan_maximum, run_part
+from sims.engines.compiled.interpreter import nan_maximum, run_instructions, run_part
 from sims.engines.compiled.step_size import (
     choose_step_divisions,
     divide_steps,
@@ -233,3 +242,40 @@ def accept_or_retry(block: Block, i: int) -> None:
         n[IS_RESTING, i] = 0
     if a[REMAINING_TIME, i] <= 0.0:
         next_step(block, i)
+
+
+COMPILED = CompiledFunctions(
+    __name__,
+    "the batch engine",
+    {
+        step_elements: BLOCK_SHAPES,
+        run_instructions: ("#i5", "#", "#", "rw", "#"),
+    },
+)
+
+
+def next_step(block: Block, i: int) -> None:
+    """Begin the next planned step of the element in slot i, with the inputs of that step.
+
+    A planned step is one of the batch's steps; it may be divided at events such as impacts. The
+    time is set to the sum of the planned steps, which removes the rounding of divided ones. After
+    the last planned step, the remaining time is zero.
+
+    Args:
+        block: force program, simulations (elements) of a batch, and their buffers. Each of the
+            `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
+            integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
+            among them, in `block.r[REGISTER, i]`.
+        i: index of the slot, the column of the batch element.
+    """
+    a = block.a
+    n = block.n
+    row = n[ELEMENT, i] if block.steps.shape[0] > 1 else 0
+    step = n[STEP_INDEX, i] + 1
+    n[STEP_INDEX, i] = step
+    n[IS_STEP_START, i] = 1
+    n[EVENT_COUNT, i] = 0
+    a[STEP_START, i] += block.steps[row, step - 1]
+    a[T, i] = a[STEP_START, i]
+    a[REMAINING_TIME, i] = block.steps[row, step] if step < block.steps.shape[1] else 0.0
+    set_inputs(block, i)

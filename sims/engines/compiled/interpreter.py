@@ -1,7 +1,7 @@
 """Vector interpreter of force programs: each instruction is one loop over the slots of a block.
 
-The functions are compiled once for all programs (`sims.engines.compiled.kernel_build`). A register
-is a row, a slot a column. Forces that cannot be written as instructions are evaluated by a function
+The functions are compiled once for all programs (`numba_compilation`). A register is a row, a slot
+a column. Forces that cannot be written as instructions are evaluated by a function
 of Python, which an instruction calls by its address (`sims.engines.compiled.register_programs`).
 Sine, cosine and exponential are computed in the same way for every element, with the argument
 reductions and coefficients of fdlibm (Sun Microsystems, 1993): x = k pi/2 + r with |r| <= pi/4, and

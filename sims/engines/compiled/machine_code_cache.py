@@ -51,7 +51,7 @@ def load_stored(
         _print_line(
             f"compiling {description}, once after an install: up to {_MAX_COMPILE_SECONDS} s"
         )
-        from sims.engines.compiled.kernel_build import build_module
+        from sims.engines.compiled.numba_compilation import build_module
 
         return build_module(module, entry, pointers, constants)
 
@@ -127,7 +127,7 @@ def list_source_files(module: str) -> list[Path]:
     """Return the source files from which the code of a module is compiled, and those around it."""
     folder = Path(__file__).parent
     files = [path for path in folder.glob("*.py") if path.name not in _PYTHON_MODULES]
-    files += [folder.parent / "ground_contact.py", Path(str(sys.modules[module].__file__))]
+    files.append(Path(str(sys.modules[module].__file__)))
     return sorted(set(files))
 
 

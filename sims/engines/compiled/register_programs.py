@@ -23,8 +23,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.engines.compiled.data_layout import BLOCK_WIDTH, FloatArray, IntTable
-from sims.engines.compiled.kernel import make_instruction_runner
+from sims.engines.compiled.data_layout import BLOCK_WIDTH, FloatArray, IntTable, uses_registers
+from sims.engines.compiled.element_stepping import COMPILED
+from sims.engines.compiled.interpreter import run_instructions
 from sims.engines.compiled.traced_array import (
     EXTERNAL,
     OPERATION_CODES,
@@ -32,12 +33,11 @@ from sims.engines.compiled.traced_array import (
     PER_EVALUATION,
     PER_IMPACT,
     ExpressionGraph,
-    ExpressionNode,
     NotTraceableError,
-    TracedArray,
     collect_nodes,
-    make_constant_nodes,
+    collect_output,
     make_input_vector,
+    sort_nodes,
 )
 
 MAX_REGISTERS = 4000
@@ -234,11 +234,11 @@ def trace_program(function: ArrayFunction) -> Program:
     inputs = [make_input_vector(graph, size, changes) for size, changes in function.groups]
     # Nodes of each output, of each evaluation and then of each impact.
     parts = [
-        [_collect_output(graph, value, size) for value, size in zip(evaluate(), sizes, strict=True)]
+        [collect_output(graph, value, size) for value, size in zip(evaluate(), sizes, strict=True)]
         for evaluate, sizes in zip(function.bind(*inputs), function.outputs, strict=True)
     ]
     registers = {node: number for number, node in enumerate(collect_nodes(*inputs))}
-    sorted_nodes = _sort_nodes([node for part in parts for nodes in part for node in nodes])
+    sorted_nodes = sort_nodes([node for part in parts for nodes in part for node in nodes])
     constants = [node for node in sorted_nodes if node.operation == "constant"]
     for node in constants:
         registers[node] = len(registers)
@@ -266,40 +266,6 @@ def trace_program(function: ArrayFunction) -> Program:
         registers=len(registers),
         constants=np.array([node.value for node in constants], dtype=np.float64),
     )
-
-
-def _collect_output(graph: ExpressionGraph, values: Any, size: int) -> list[ExpressionNode]:
-    """Return the nodes of an output, broadcast to its size.
-
-    Args:
-        graph: graph to which constant nodes are added.
-        values: traced array, or numbers.
-        size: number of values.
-    """
-    nodes = values.nodes if isinstance(values, TracedArray) else make_constant_nodes(graph, values)
-    return list(np.broadcast_to(nodes, (1, size))[0])
-
-
-def _sort_nodes(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:
-    """Return the outputs and all nodes on which they depend, each after its arguments.
-
-    It is a depth-first topological sort. It uses a stack, because recursion would be too deep for
-    large graphs. A node is on the stack twice: first to put its arguments on top of it, and then to
-    be added after them.
-
-    Args:
-        outputs: Nodes whose values the program must produce.
-    """
-    order: dict[ExpressionNode, None] = {}
-    stack = [(node, False) for node in reversed(outputs)]
-    while stack:
-        node, has_arguments_in_order = stack.pop()
-        if has_arguments_in_order:
-            order[node] = None
-        elif node not in order:
-            stack.append((node, True))
-            stack += [(arg, False) for arg in reversed(node.args)]
-    return list(order)
 
 
 class TracedSource(NamedTuple):
@@ -412,3 +378,28 @@ def check_program(function: ArrayFunction, samples: Iterable[Array]) -> None:
                 equal_nan=True,
             ):
                 raise NotTraceableError("its compiled form gives other numbers")
+
+
+def make_instruction_runner(
+    code: IntTable, first: int, last: int, r: FloatArray
+) -> Callable[[], None]:
+    """Return a function that runs instructions on the present values of the registers.
+
+    Machine code does not check array bounds, so the instructions are checked once, here.
+
+    Args:
+        code: (n, 5) n instructions; see `ProgramArrays`.
+        first: index of the first instruction.
+        last: index after the last instruction.
+        r: (registers, W) registers of W slots.
+
+    Returns:
+        The function without arguments.
+
+    Raises:
+        ValueError: an instruction uses a register that does not exist.
+    """
+    run = COMPILED.bind(run_instructions, code, first, last, r, r.shape[1])
+    if not (0 <= first <= last <= len(code) and uses_registers(code, len(r))):
+        raise ValueError("the instructions are not for these registers")
+    return run

@@ -602,3 +602,37 @@ def make_input_vector(graph: ExpressionGraph, size: int, changes: int) -> Any:
 def collect_nodes(*arrays: TracedArray) -> list[ExpressionNode]:
     """Return all nodes of traced arrays, in order."""
     return [node for array in arrays for node in array.nodes.ravel()]
+
+
+def collect_output(graph: ExpressionGraph, values: Any, size: int) -> list[ExpressionNode]:
+    """Return the nodes of an output, broadcast to its size.
+
+    Args:
+        graph: graph to which constant nodes are added.
+        values: traced array, or numbers.
+        size: number of values.
+    """
+    nodes = values.nodes if isinstance(values, TracedArray) else make_constant_nodes(graph, values)
+    return list(np.broadcast_to(nodes, (1, size))[0])
+
+
+def sort_nodes(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:
+    """Return the outputs and all nodes on which they depend, each after its arguments.
+
+    It is a depth-first topological sort. It uses a stack, because recursion would be too deep for
+    large graphs. A node is on the stack twice: first to put its arguments on top of it, and then to
+    be added after them.
+
+    Args:
+        outputs: Nodes whose values the program must produce.
+    """
+    order: dict[ExpressionNode, None] = {}
+    stack = [(node, False) for node in reversed(outputs)]
+    while stack:
+        node, has_arguments_in_order = stack.pop()
+        if has_arguments_in_order:
+            order[node] = None
+        elif node not in order:
+            stack.append((node, True))
+            stack += [(arg, False) for arg in reversed(node.args)]
+    return list(order)

@@ -23,7 +23,8 @@ seconds away. There the engine solves the contact in a separate step, of which o
 velocity is used, and the rest of the step follows. The error of an impact is therefore that of the
 flight: of second order in h, and zero under gravity alone.
 
-The condition for the end of bouncing is that of the batch engine (`sims.engines.ground_contact`).
+The condition for the end of bouncing is that of the batch engine
+(`sims.engines.compiled.ground_impacts`).
 
 `integrate_native_ball` uses the engine's own contact model. The result is of first order in the
 step. Effects act through their force at the beginning of each step. Their contact parameters are
@@ -46,9 +47,13 @@ import numpy as np
 from sims.core.effect import Contact
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
+from sims.engines.compiled.ground_impacts import (
+    MAX_SHORT_FLIGHTS,
+    MIN_FLIGHT_SECONDS,
+    SHORT_FLIGHT_SECONDS,
+)
 from sims.engines.external.element_forces import ElementForces, Vector
 from sims.engines.external.external_engine import ElementWork, Trajectory
-from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, SHORT_FLIGHT_SECONDS
 
 BallState = tuple[Vector, Vector]
 """Position and the engine's velocity."""

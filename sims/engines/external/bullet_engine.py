@@ -16,7 +16,7 @@ from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulator import InputError
 from sims.core.system import System
 from sims.engines.external import ball_integration, bullet_world, joint_integration
-from sims.engines.external.bullet_balls import BulletBall, BulletNativeBall
+from sims.engines.external.bullet_ball_contact import BulletBall, BulletNativeBall
 from sims.engines.external.external_engine import (
     RolloutFunction,
     integrate_batch,

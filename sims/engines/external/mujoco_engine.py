@@ -15,16 +15,16 @@ from typing import cast
 from sims.core.argument_checks import check_positive
 from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.mujoco_import import import_mujoco
-from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
 from sims.core.system import System
+from sims.core.user_messages import truncate_text
 from sims.engines.external import ball_integration, joint_integration
 from sims.engines.external.external_engine import (
     RolloutFunction,
     integrate_batch,
     resolve_time_step,
 )
-from sims.engines.external.mujoco_balls import MujocoBall, MujocoSoftBall
+from sims.engines.external.mujoco_ball_contact import MujocoBall, MujocoSoftBall
 from sims.engines.external.mujoco_world import CompiledWorld, MujocoJoint, write_joint_model
 from sims.engines.external.world_interface import (
     MujocoWorldModule,

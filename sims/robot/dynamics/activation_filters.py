@@ -26,11 +26,6 @@ ACTIVATION_PREFIX = "act."
 """Prefix of the names under which a recording specifies activations."""
 MIN_TIME_CONSTANT = 1e-15
 """Smallest time constant in seconds, MuJoCo's mjMINVAL."""
-SETTLING_TIME_CONSTANTS = 10.0
-"""Number of time constants after which a wrong initial activation has no effect.
-
-The remaining share exp(-10) is less than the accuracy of a simulation.
-"""
 
 
 class ActivationFilter(NamedTuple):
@@ -144,24 +139,6 @@ def select_initial_activations(robot: RobotModel, initial: Mapping[str, float]) 
     """
     activation_names = {one_filter.state for one_filter in activation_filters(robot)}
     return {name: value for name, value in initial.items() if name in activation_names}
-
-
-def compute_settling_time(robot: RobotModel, initial: Mapping[str, float]) -> float:
-    """Return the time in seconds after which no filter depends on its initial activation.
-
-    Filters whose initial activation is specified are ignored. The slowest of the others decides:
-    the time is `SETTLING_TIME_CONSTANTS` times its time constant, or zero without such filters.
-
-    Args:
-        robot: robot with the filters before its actuators.
-        initial: initial states of the run, by name.
-    """
-    unknown_filters = [
-        one_filter for one_filter in activation_filters(robot) if one_filter.state not in initial
-    ]
-    return SETTLING_TIME_CONSTANTS * max(
-        (one_filter.seconds for one_filter in unknown_filters), default=0.0
-    )
 
 
 def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | None:

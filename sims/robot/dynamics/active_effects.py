@@ -10,8 +10,7 @@ import numpy as np
 from sims.core.effect import ActiveEffects, Effect, Force, Friction, HiddenStateEffect
 from sims.core.simulator import Array
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
-from sims.robot.dynamics.series_joints import is_series_effect
-from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+from sims.robot.model_field_effects import is_model_field_effect
 from sims.robot.places.placed_effect_classes import SHARED_ACTUATOR_EFFECTS
 
 TIME_DEPENDENT_EFFECTS = frozenset({"force.bias", "force.periodic"})
@@ -35,29 +34,6 @@ def is_in_drive(effect: Effect) -> bool:
     return isinstance(effect, Force) and (
         effect.at == "actuator" or effect.of in SHARED_ACTUATOR_EFFECTS
     )
-
-
-def is_model_field_effect(effect: Effect) -> bool:
-    """Return whether the engine writes the effect into fields of the MuJoCo model."""
-    has_field = (effect.of or effect.name) in MODEL_FIELD_EFFECTS
-    return is_series_effect(effect) or (has_field and effect.hook in ("value", "force", "contact"))
-
-
-def changes_derived_constants(effect: Effect) -> bool:
-    """Return whether MuJoCo derives constants from the model fields that the effect changes.
-
-    An example is a mass, from which MuJoCo derives inverse weights of bodies and joints. An effect
-    at one place has the name of the registered effect in `of`.
-    """
-    return is_model_field_effect(effect) and (
-        is_series_effect(effect)
-        or MODEL_FIELD_EFFECTS[effect.of or effect.name].changes_derived_constants
-    )
-
-
-def select_model_field_effects(acting: ActiveEffects) -> ActiveEffects:
-    """Select the effects that are written into fields of the MuJoCo model."""
-    return tuple((e, c) for e, c in acting if is_model_field_effect(e))
 
 
 def is_evaluated_per_step(effect: Effect) -> bool:

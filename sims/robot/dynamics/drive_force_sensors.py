@@ -11,7 +11,7 @@ import numpy as np
 
 from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array
-from sims.robot.coupled_drives import find_preceding_joint
+from sims.robot.coupled_drives import COUPLING_FIELD, find_preceding_joint, get_coupling_address
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.active_effects import (
     find_active_elements,
@@ -22,7 +22,6 @@ from sims.robot.dynamics.disabled_drives import find_working_servos
 from sims.robot.dynamics.effect_forces import compute_drive_effect_forces, make_snapshot
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
 from sims.robot.dynamics.run_batches import BatchInputs
-from sims.robot.model_field_effects import COUPLING_FIELD, get_coupling_address
 from sims.robot.robot_model import Actuator, RobotModel
 from sims.robot.robot_system import RobotSystem
 

@@ -30,9 +30,9 @@ from sims.robot.dynamics.active_effects import LOAD_DEPENDENT_EFFECTS, StepEffec
 from sims.robot.dynamics.effect_forces import (
     compute_effect_forces,
     compute_friction_limits,
-    compute_hidden_state_forces,
     make_snapshot,
 )
+from sims.robot.dynamics.hidden_states import compute_hidden_state_forces
 from sims.robot.dynamics.midpoint_state import JointStates, Mask, predict_midpoint
 from sims.robot.dynamics.mujoco_batch import JointAddresses
 from sims.robot.robot_system import RobotSystem

@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sims.core.effect import ActiveEffects, Force, Friction, HiddenState, HiddenStateEffect
+from sims.core.effect import ActiveEffects, Force, Friction
 from sims.core.simulator import Array
 from sims.robot.dynamics.active_effects import TIME_DEPENDENT_EFFECTS, is_in_drive
-from sims.robot.dynamics.hidden_states import advance_state
 from sims.robot.robot_system import RobotSystem
 from sims.robot.state_snapshots import RobotSnapshot
 
@@ -133,38 +132,3 @@ def compute_friction_limits(
         assert joint is not None  # dry friction always acts at a joint
         limit[:, joint] = limit[:, joint] + effect.limit(c, snapshot)[:, 0]
     return limit
-
-
-def compute_hidden_state_forces(
-    hidden: Sequence[tuple[HiddenStateEffect, Array]],
-    snapshots: tuple[RobotSnapshot, RobotSnapshot],
-    states: Sequence[HiddenState],
-    step: float,
-) -> tuple[Array, list[HiddenState]]:
-    """Advance hidden states of effects, and compute their forces afterwards.
-
-    A hidden state is a variable that an effect has in addition to the state of the robot, such as
-    the deflection of bristles in a friction model. In batch elements in which the first coefficient
-    of an effect is not above zero, it exerts no force.
-
-    Shapes: L batch elements, D joints, K coefficients.
-
-    Args:
-        hidden: effects with their coefficients (K, L, 1).
-        snapshots: snapshots during the interval, with which the states advance; and at its end, at
-            which the forces are evaluated.
-        states: hidden states of the effects at the beginning.
-        step: length of the interval in seconds.
-
-    Returns:
-        Total force (L, D) and hidden states at the end of the interval.
-    """
-    during, end = snapshots
-    total = np.zeros_like(end.x)
-    later_states = []
-    for (effect, c), state in zip(hidden, states, strict=True):
-        after = advance_state(effect, c, during, state, step)
-        force, _ = effect.act(c, end, after)  # the rate of the state is not needed here
-        total = total + np.where(c[0] > 0, force, 0.0)
-        later_states.append(after)
-    return total, later_states

@@ -17,24 +17,23 @@ from sims.core.effect import ActiveEffects, Effect, Force, Friction, HiddenState
 from sims.core.simulator import Array
 from sims.recording.recorded_poses import POSITION_AXES
 from sims.robot.dry_friction import get_friction_constraint
-from sims.robot.dynamics.active_effects import (
-    LOAD_DEPENDENT_EFFECTS,
-    StepEffects,
-    is_in_drive,
-    select_model_field_effects,
-)
+from sims.robot.dynamics.active_effects import LOAD_DEPENDENT_EFFECTS, StepEffects, is_in_drive
 from sims.robot.dynamics.disabled_drives import ForceRanges, Mask, find_working_servos
 from sims.robot.dynamics.effect_forces import (
     compute_drive_effect_forces,
     compute_effect_forces,
     compute_friction_limits,
-    compute_hidden_state_forces,
     make_snapshot,
 )
-from sims.robot.dynamics.hidden_states import advance_state, integrate_state
+from sims.robot.dynamics.hidden_states import (
+    advance_state,
+    compute_hidden_state_forces,
+    integrate_state,
+)
 from sims.robot.dynamics.midpoint_state import IndexArray, forces_are_at_step_end
 from sims.robot.dynamics.mujoco_batch import JointAddresses, MujocoBatch
 from sims.robot.floating_joints import FloatingState
+from sims.robot.model_field_effects import select_model_field_effects
 from sims.robot.robot_system import RobotSystem
 from sims.robot.state_snapshots import RobotSnapshot
 
@@ -739,3 +738,26 @@ def _repeat_coefficients(acting: ActiveEffects, count: int) -> ActiveEffects:
         count: number of elements.
     """
     return tuple((e, np.repeat(c, count, axis=1)) for e, c in select_model_field_effects(acting))
+
+
+def find_neighbours(point_steps: IndexArray, spacing: int) -> IndexArray:
+    """Find the pairs of linearisation points between which values are interpolated.
+
+    Points follow one another at a regular distance, until a command changes. Two points that are
+    not `spacing` steps apart therefore belong to different commands, between which nothing is
+    interpolated. A point forms a pair with the next point of its command, or else with the previous
+    one. If neither exists, it forms a pair with itself.
+
+    Args:
+        point_steps: (N,) steps of the N linearisation points.
+        spacing: regular number of steps between two points.
+
+    Returns:
+        (2, N) indices of the earlier and the later point of each point's pair.
+    """
+    numbers = np.arange(point_steps.size)
+    has_next = np.append(np.diff(point_steps) == spacing, False)
+    has_previous = np.append(False, np.diff(point_steps) == spacing)
+    earlier = np.where(has_next, numbers, np.where(has_previous, numbers - 1, numbers))
+    later = np.where(has_next, numbers + 1, numbers)
+    return np.stack([earlier, later])

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 from sims.core.effect import ActiveEffects
 from sims.core.mujoco_import import disable_step_profiler
 from sims.core.simulator import Array
+from sims.robot.coupled_drives import COUPLING_FIELD
 from sims.robot.dry_friction import write_friction_form
 from sims.robot.dynamics.added_elements import AddedElements, add_elements
 from sims.robot.dynamics.disabled_drives import (
@@ -40,12 +41,8 @@ from sims.robot.dynamics.series_joints import (
 )
 from sims.robot.dynamics.servo_force_limits import ForceLimits, find_stiff_force_limits
 from sims.robot.floating_joints import FloatingJoints, FloatingState
-from sims.robot.model_field_effects import (
-    CONTACT_FIELDS,
-    COUPLING_FIELD,
-    MODEL_FIELD_EFFECTS,
-    get_write_order,
-)
+from sims.robot.integrator_settings import with_integrator_settings
+from sims.robot.model_field_effects import CONTACT_FIELDS, MODEL_FIELD_EFFECTS, get_write_order
 from sims.robot.model_simplification import strip_assets
 from sims.robot.mujoco_messages import format_mujoco_error
 from sims.robot.parsing.collision_filters import can_collide
@@ -159,24 +156,6 @@ def find_drive_sensors(model: Any, robot: RobotModel) -> dict[str, int]:
         joint.name: int(model.sensor(DRIVE_SENSOR_PREFIX + joint.name).adr[0])
         for joint in robot.file_joints
     }
-
-
-def with_integrator_settings(robot: RobotModel, settings: Mapping[str, float]) -> RobotModel:
-    """Return the robot with other options of its model; the robot itself if they are equal.
-
-    Args:
-        robot: robot whose model has options already.
-        settings: wanted options by name, such as ``timestep``, as numbers.
-    """
-    compiled_options = robot.compiled.opt
-    if all(getattr(compiled_options, name) == value for name, value in settings.items()):
-        return robot
-    spec = robot.spec.copy()
-    for name, value in settings.items():
-        # An option that is an integer in the compiled model must be set to an integer.
-        option_type = type(getattr(compiled_options, name))
-        setattr(spec.option, name, option_type(value))
-    return replace(robot, spec=spec)
 
 
 class MujocoBatch:

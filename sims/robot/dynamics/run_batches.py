@@ -9,26 +9,16 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.core.effect import ActiveEffects, Sensor
+from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array, Scenario
 from sims.engines.scenario_groups import ScenarioGroups
-from sims.robot.dynamics.active_effects import (
-    changes_derived_constants,
-    find_active_elements,
-    is_evaluated_per_step,
-)
+from sims.robot.dynamics.active_effects import find_active_elements, is_evaluated_per_step
 from sims.robot.dynamics.added_elements import group_by_added_elements
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.floating_joints import FloatingState
+from sims.robot.model_field_effects import changes_derived_constants
 
 Number = TypeVar("Number", bound=np.generic)
-
-MAX_DURATION_FACTOR, MAX_EXTRA_SECONDS = 1.1, 0.2
-"""Maximum simulated time after the last time stamp if sensors sample early.
-
-A run is simulated for at most `MAX_DURATION_FACTOR` times its duration plus `MAX_EXTRA_SECONDS`
-seconds.
-"""
 
 
 class RobotRunBatch(NamedTuple):
@@ -53,30 +43,6 @@ class RobotRunBatch(NamedTuple):
         """Sample times (T,) in seconds since the start."""
         result: Array = self.scenario.times - self.scenario.times[0]
         return result
-
-
-def list_last_read_times(work: RobotRunBatch) -> Array:
-    """Return the last time at which a sensor is read in a run, in seconds since its start.
-
-    The simulation must last until then. Without effects on sensors it is the last time stamp. If
-    an effect makes the clock of the recording slow, the true time is later.
-
-    Args:
-        work: batch elements of the run, with their active effects.
-
-    Returns:
-        An array (1,) with the time, which is at most `MAX_DURATION_FACTOR` times the last time
-        stamp plus `MAX_EXTRA_SECONDS`.
-    """
-    last_stamp = float(work.times[-1])
-    latest = last_stamp
-    for effect, c in work.acting:
-        if isinstance(effect, Sensor):
-            # True times of the last stamp in all n batch elements, (n, 1).
-            true_times = effect.times(c, np.full(c[0].shape, last_stamp))
-            latest = max(latest, float(np.max(true_times)))
-    # Implausible values that a fit tries must not cost thousands of steps.
-    return np.array([min(latest, MAX_DURATION_FACTOR * last_stamp + MAX_EXTRA_SECONDS)])
 
 
 class BatchStart(NamedTuple):

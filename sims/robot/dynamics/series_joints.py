@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Effect, HiddenStateEffect, SeriesElement
 from sims.core.simulator import Array
+from sims.effects.transmission import combine_elements, make_series_element
 from sims.robot.dynamics.inverse_dynamics import inertia_matrix
 from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
 from sims.robot.robot_model import RobotModel, cache_per_robot
@@ -203,26 +204,6 @@ def write_series_effects(
         )
     for joint, elements in elements_by_joint.items():
         write_series_element(fields, robot, joint, combine_elements(elements))
-
-
-def make_series_element(kind: type[Effect], numbers: Mapping[str, Array]) -> SeriesElement:
-    """Make the element in series with a joint, a spring or a gap, from an effect's coefficients.
-
-    Args:
-        kind: class of the effect, for which `is_series_effect` is true.
-        numbers: coefficients (L,) of L batch elements by name; missing ones are zero.
-    """
-    assert issubclass(kind, HiddenStateEffect)
-    zeros = np.zeros_like(next(iter(numbers.values())))
-    # `between` are the coefficients of an element whose both sides are known, as in a robot.
-    values = [numbers.get(coefficient.name, zeros) for coefficient in kind.between]
-    return kind().element(np.stack(values))
-
-
-def combine_elements(elements: Sequence[SeriesElement]) -> SeriesElement:
-    """Combine several elements in series with one joint by adding their numbers."""
-    names = ("stiffness", "damping", "gap", "drive")
-    return SeriesElement(*(np.sum([getattr(e, name) for e in elements], axis=0) for name in names))
 
 
 def write_series_element(

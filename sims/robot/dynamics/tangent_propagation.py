@@ -39,7 +39,7 @@ import numpy as np
 from sims.core.effect import ActiveEffects, Effect
 from sims.core.simulator import Array
 from sims.robot.dynamics.active_effects import is_in_drive
-from sims.robot.dynamics.linearisation_points import LinearisationPoints
+from sims.robot.dynamics.linearisation_points import LinearisationPoints, find_neighbours
 from sims.robot.dynamics.midpoint_state import IndexArray, Mask
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
 
@@ -173,7 +173,7 @@ class TangentModel:
             step_numbers - at.point_steps[at.point_of_step]
         ) / at.point_spacing
         # Indices (S,) of the two points between which values at points are interpolated to a step.
-        earlier_points, later_points = _find_neighbours(at.point_steps, at.point_spacing)
+        earlier_points, later_points = find_neighbours(at.point_steps, at.point_spacing)
         self._earlier_point = earlier_points[at.point_of_step]
         self._later_point = later_points[at.point_of_step]
         # If commands change at other times, the linearisation points differ.
@@ -686,26 +686,3 @@ def compute_runge_kutta_step(
     propagator = step * (unit + scaled @ (unit / 2 + scaled @ (unit / 6 + scaled / 24)))
     of_velocity = propagator[:, :, joints:]  # L is zero for the positions
     return unit + propagator @ rates, of_velocity @ by_force, of_velocity @ by_control
-
-
-def _find_neighbours(point_steps: IndexArray, spacing: int) -> IndexArray:
-    """Find the pairs of linearisation points between which values are interpolated.
-
-    Points follow one another at a regular distance, until a command changes. Two points that are
-    not `spacing` steps apart therefore belong to different commands, between which nothing is
-    interpolated. A point forms a pair with the next point of its command, or else with the previous
-    one. If neither exists, it forms a pair with itself.
-
-    Args:
-        point_steps: (N,) steps of the N linearisation points.
-        spacing: regular number of steps between two points.
-
-    Returns:
-        (2, N) indices of the earlier and the later point of each point's pair.
-    """
-    numbers = np.arange(point_steps.size)
-    has_next = np.append(np.diff(point_steps) == spacing, False)
-    has_previous = np.append(False, np.diff(point_steps) == spacing)
-    earlier = np.where(has_next, numbers, np.where(has_previous, numbers - 1, numbers))
-    later = np.where(has_next, numbers + 1, numbers)
-    return np.stack([earlier, later])

@@ -16,16 +16,15 @@ from sims import effects as library
 from sims.core.effect import SeriesElement
 from sims.core.freed_memory import release_free_memory
 from sims.core.simulator import Array
+from sims.effects.transmission import combine_elements, make_series_element
 from sims.extended_simulator import FittedValue
 from sims.robot.contact_pairs import add_contact_pairs
 from sims.robot.coupled_drives import COUPLING_EFFECT, make_coupled_robot
 from sims.robot.dynamics.series_joints import (
     add_series_joints,
-    combine_elements,
     find_series_joint,
     is_compliant_flank,
     is_series_effect,
-    make_series_element,
     prepare_flanks_for_file,
     write_series_element,
 )
@@ -36,6 +35,8 @@ from sims.robot.export.mjcf_attributes import (
     ENUM_ATTRIBUTES,
     FLAG_ATTRIBUTES,
     INTEGER_ATTRIBUTES,
+    MAX_CORRECTION_ROUNDS,
+    ROUNDING_TOLERANCE,
     AttributeStatement,
     Fields,
     Kind,
@@ -49,14 +50,6 @@ from sims.robot.export.mjcf_writer import format_spec
 from sims.robot.fitted_causes import FittedCause, expand_families, is_gravity_compensated
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.robot_model import RobotModel
-
-MAX_CORRECTION_ROUNDS = 4
-"""Maximum number of rounds that restore values which another change has modified."""
-
-ROUNDING_TOLERANCE = 1e-13
-"""Relative difference between compiled numbers that counts as rounding."""
-
-KEPT_VALUE_NOTE = "unchanged: without this line another change would alter it"
 
 KEYFRAMES_OMITTED_NOTE = "keyframes are left out: they lack the coordinates of joints in series"
 

@@ -13,13 +13,12 @@ from sims.robot.export.mjcf_attributes import (
     Values,
     list_all_attributes,
 )
-from sims.robot.export.mjcf_document import FILE_ELEMENTS, MjcfDocument
+from sims.robot.export.mjcf_document import FILE_ELEMENTS, MjcfDocument, compile_mjcf
 from sims.robot.export.mjcf_writer import (
     SHORTCUT_ATTRIBUTES,
     format_attributes,
 )
-from sims.robot.export.model_comparison import find_first_difference
-from sims.robot.export.write_model_file import EQUAL_NUMBERS_TOLERANCE, compile_mjcf
+from sims.robot.export.model_comparison import EQUAL_NUMBERS_TOLERANCE, find_first_difference
 from sims.robot.export.xml_editing import (
     NotEditableError,
     format_comment,

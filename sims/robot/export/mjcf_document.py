@@ -9,8 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from sims.core.freed_memory import release_free_memory
 from sims.robot.export.mjcf_attributes import ModelElement
 from sims.robot.export.xml_editing import NotEditableError, XmlElement, XmlText, format_element
+from sims.robot.mujoco_messages import capture_mujoco_warnings
 
 _UNSUPPORTED_ELEMENTS = ("replicate", "attach", "composite", "flexcomp", "model")
 """Elements that generate several elements, or refer to those of another file."""
@@ -281,3 +283,21 @@ def _check_elements_match_model(
         name = str(getattr(model, kind)(number).name)
         if tag.attributes.get("name", "") != name:
             raise NotEditableError(f"the compiled model has its elements in another order ({name})")
+
+
+def compile_mjcf(text: str) -> Any:
+    """Compile an MJCF text without printing MuJoCo's warnings.
+
+    Raises:
+        NotEditableError: MuJoCo rejects the text.
+    """
+    import mujoco
+
+    try:
+        with capture_mujoco_warnings():
+            model = mujoco.MjSpec.from_string(text).compile()
+    except ValueError as error:
+        raise NotEditableError(f"MuJoCo refuses it: {' '.join(str(error).split())}") from None
+    # The discarded spec held all meshes a second time.
+    release_free_memory()
+    return model

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sims.robot.coupled_drives import find_preceding_joint
+from sims.robot.coupled_drives import find_preceding_joint, get_coupling_address
 from sims.robot.export.mjcf_attributes import (
     ANGLE_ATTRIBUTES,
     ENUM_ATTRIBUTES,
@@ -32,21 +32,245 @@ from sims.robot.export.xml_editing import (
     format_number,
     format_numbers,
 )
-from sims.robot.model_field_effects import get_coupling_address
 from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
-
-_ORIENTATION_ATTRIBUTES = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
-"""Attributes that are alternatives to ``quat`` and ``diaginertia``."""
 
 SHORTCUT_ATTRIBUTES = ("kp", "kv", "ki", "dampratio", "timeconst", "inheritrange")
 """Attributes of MuJoCo's actuator shortcuts that ``general`` does not have."""
+
+
+_LIST_ATTRIBUTES = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
+
+_ORIENTATION_ATTRIBUTES = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
+"""Attributes that are alternatives to ``quat`` and ``diaginertia``."""
 
 _INPUT_BY_SHORTCUT = {"position": "pos", "velocity": "vel"}
 """Values of the attribute ``input`` (MuJoCo 4.0 and later) that replace an actuator shortcut."""
 
 _GAIN_ATTRIBUTES = {"gainprm", "biasprm"}
 
-_LIST_ATTRIBUTES = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
+
+def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
+    """Format values as text of attributes."""
+    return {name: _format_values(name, value) for name, value in values.items()}
+
+
+def _format_values(name: str, values: tuple[float, ...]) -> str:
+    """Format the numbers of an attribute for MJCF, as its kind demands.
+
+    An enumeration becomes a word, a flag ``true`` or ``false``, a count an integer; all others are
+    a number or a list of numbers.
+
+    Args:
+        name: name of the attribute.
+        values: its numbers, as in the compiled model.
+    """
+    # ``interp``, a kind of interpolation, is a word in a file but a plain integer in a spec.
+    if name in ENUM_ATTRIBUTES or name == "interp":
+        return get_enum_word(name, values[0])
+    if name in FLAG_ATTRIBUTES:
+        return "true" if values[0] else "false"
+    if name in INTEGER_ATTRIBUTES:
+        return str(int(values[0]))
+    if name in _LIST_ATTRIBUTES:
+        # Trailing zeros are omitted, since numbers missing in a list are zero.
+        last_nonzero = max((i for i, value in enumerate(values) if value), default=0)
+        return format_numbers(values[: last_nonzero + 1])
+    return format_numbers(values)
+
+
+EXACT_DIGITS = 17
+"""Number of significant digits with which every float64 number is read back exactly."""
+
+
+def format_spec(spec: Any, folder: Path) -> str:
+    """Format an editable MuJoCo model as MJCF with full precision and absolute asset folders.
+
+    MuJoCo writes six digits by default, which would change the motion. Angles and other values keep
+    the notation of the model file.
+
+    Args:
+        spec: compiled `mujoco.MjSpec`; it must not be used afterwards.
+        folder: folder to which the paths of its assets are relative.
+
+    Returns:
+        The MJCF text.
+
+    Raises:
+        RuntimeError: this MuJoCo library has no function that sets the number of digits.
+    """
+    spec.meshdir = str(folder / spec.meshdir)
+    spec.texturedir = str(folder / spec.texturedir)
+    spec.compiler.savecompiled = False
+    spec.compiler.savecanonical = False
+    # The number of digits is a setting of MuJoCo's library, which is restored afterwards.
+    library = _load_library()
+    try:
+        digits = library._mjPRIVATE__get_xml_precision()
+        library._mjPRIVATE__set_xml_precision(EXACT_DIGITS)
+    except AttributeError:
+        raise RuntimeError("this MuJoCo writes models with six digits only") from None
+    try:
+        return str(spec.to_xml())
+    finally:
+        library._mjPRIVATE__set_xml_precision(digits)
+
+
+@cache
+def _load_library() -> Any:
+    """Load MuJoCo's shared library; its Python module does not expose the number of digits."""
+    import mujoco
+
+    folder = Path(mujoco.__file__).parent
+    patterns = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")  # Linux, macOS, Windows
+    path, *_ = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
+    return ctypes.CDLL(str(path))
+
+
+def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
+    """Return the text of the model file with the elements that causes add, and a fixed base.
+
+    1. For a base that a recording fixes, remove free joints and keyframes.
+    2. Add tendons of coupled drives.
+    3. Add pairs of geoms with contact parameters of their own.
+    4. Add joints in series (second joints of flexible or slack drives).
+
+    Other numbers are written afterwards. Without any of these elements, the text is unchanged.
+
+    Args:
+        robot: robot with the added elements.
+        model: compiled model with the causes.
+
+    Raises:
+        NotEditableError: the text does not contain a required joint, actuator or geom.
+    """
+    text = robot.path.read_bytes()
+    has_fixed_base = robot.engine_table.get("fix_base", False)
+    if not robot.series and not robot.coupled and not has_fixed_base and not robot.spec.pairs:
+        return text
+    document = MjcfDocument(text, robot.path)
+    # 1. As by `parsing.floating_bases.fix_bases`. An element with an empty text is left out.
+    if has_fixed_base:
+        for tag in document.walk():
+            is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
+            if tag.name in ("freejoint", "keyframe") or is_free:
+                tag.text = b""
+    # 2. Tendons.
+    if robot.coupled:
+        _write_couplings(document, robot, model)
+    # 3. Pairs.
+    _add_pairs(document, robot)
+    # 4. Joints in series, each after the joint of its drive.
+    tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
+    for series_joint in (joint for joint in robot.spec.joints if joint.name in robot.series):
+        # Its name is that of the drive's joint and an ending.
+        drive_joint, _, _ = series_joint.name.rpartition("_")
+        joint_tag = tags.get(drive_joint)
+        if joint_tag is None:
+            raise NotEditableError(f"no joint of its text is in series with {series_joint.name}")
+        joint_tag.after.append(_render_series_joint(series_joint))
+    return document.to_text().encode()
+
+
+def _write_couplings(document: MjcfDocument, robot: RobotModel, model: Any) -> None:
+    """Write the couplings of drives: a fixed tendon for each, which the joint's actuators drive.
+
+    The length of the tendon is q + c q_first, with the position q of the drive's joint, that of the
+    preceding joint q_first, and the coefficient c.
+
+    Args:
+        document: the MJCF, changed in place.
+        robot: robot with the couplings.
+        model: compiled model with the causes, which has the coefficients of the couplings.
+
+    Raises:
+        NotEditableError: the text lacks a joint or an actuator of the compiled model.
+    """
+    # Elements of the actuators, in the order of their numbers.
+    tags = [child for tag in document.find_elements("actuator") for child in document.children(tag)]
+    if len(tags) != len(robot.actuators):
+        raise NotEditableError("the compiled model has other actuators")
+    joint_names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
+    for name in robot.coupled:
+        first = find_preceding_joint(robot, name)
+        assert first is not None  # only joints with a preceding one can be coupled
+        if not {name, first.name} <= joint_names:
+            raise NotEditableError(f"no joint of its text is called {name} or {first.name}")
+        c = format_number(float(model.wrap_prm[get_coupling_address(robot, name)]))
+        joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
+        tendon = f'<fixed name="{name}{COUPLING_TENDON_SUFFIX}">{joints}</fixed>'
+        document.root.insert_within(f"<tendon>{tendon}</tendon>")
+        # The actuators of the joint get the tendon as their target.
+        for actuator in (a for a in robot.actuators if a.joint == name):
+            tags[actuator.id].removed |= {"joint", "jointinparent"}
+            tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"
+
+
+def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
+    """Write the elements `<pair>` of a robot that the text lacks.
+
+    A pair states the parameters of one contact; it refers to its geoms by their names.
+
+    Args:
+        document: the MJCF, changed in place.
+        robot: the robot with its pairs.
+
+    Raises:
+        NotEditableError: a geom has no name in the text.
+    """
+    existing_pairs = document.find_pairs()
+    names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "geom"}
+    for pair in robot.spec.pairs:
+        geoms = frozenset((pair.geomname1, pair.geomname2))
+        if geoms in existing_pairs:
+            continue
+        if not geoms <= names:
+            raise NotEditableError(f"a geom of the contact {pair.name} has no name in its text")
+        attributes = {"name": pair.name, "geom1": pair.geomname1, "geom2": pair.geomname2}
+        attributes["condim"] = str(pair.condim)
+        for name in ("friction", "solref", "solimp"):
+            attributes[name] = format_numbers(tuple(getattr(pair, name)))
+        attributes |= {name: format_number(getattr(pair, name)) for name in ("margin", "gap")}
+        pair_text = format_element("pair", attributes)
+        document.root.insert_within(f"<contact>{pair_text}</contact>")
+
+
+def _render_series_joint(second: Any) -> str:
+    """Render a joint that is added in series with another one as an MJCF element.
+
+    All attributes are stated, so that the file's default classes have no influence on it. A limited
+    range represents backlash.
+
+    Args:
+        second: joint of the `mujoco.MjSpec`.
+    """
+    kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
+    is_limited = str(second.limited).endswith("TRUE")
+    attributes = {
+        "name": second.name,
+        "type": kind,
+        "axis": format_numbers(tuple(second.axis)),
+        "pos": format_numbers(tuple(second.pos)),
+        "limited": "true" if is_limited else "false",
+        "actuatorfrclimited": "false",
+    }
+    if is_limited:
+        attributes["range"] = format_numbers(tuple(second.range))
+        attributes["solreflimit"] = format_numbers(tuple(second.solref_limit))
+        attributes["solimplimit"] = format_numbers(tuple(second.solimp_limit))
+    attributes |= dict.fromkeys(("damping", "frictionloss", "armature", "stiffness"), "0")
+    return format_element("joint", attributes)
+
+
+def format_heading(path: Path, recording: str, notes: Iterable[str]) -> str:
+    """Format the comment at the top of a written file: its origin, and notes.
+
+    Args:
+        path: model file from which it was made.
+        recording: title of the recording to which its causes were fitted; empty if none.
+        notes: a line for each note.
+    """
+    origin = f", with the causes found in {recording}" if recording else ""
+    return "\n     ".join([f"{path.name}{origin}; written by simgap", *notes])
 
 
 class MjcfWriter:
@@ -297,215 +521,3 @@ def _format_shortcut(
 
 def _add_comments(tag: XmlElement, comments: Sequence[str]) -> None:
     tag.before += [text for text in comments if text not in tag.before]
-
-
-def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
-    """Format values as text of attributes."""
-    return {name: _format_values(name, value) for name, value in values.items()}
-
-
-def _format_values(name: str, values: tuple[float, ...]) -> str:
-    """Format the numbers of an attribute for MJCF, as its kind demands.
-
-    An enumeration becomes a word, a flag ``true`` or ``false``, a count an integer; all others are
-    a number or a list of numbers.
-
-    Args:
-        name: name of the attribute.
-        values: its numbers, as in the compiled model.
-    """
-    # ``interp``, a kind of interpolation, is a word in a file but a plain integer in a spec.
-    if name in ENUM_ATTRIBUTES or name == "interp":
-        return get_enum_word(name, values[0])
-    if name in FLAG_ATTRIBUTES:
-        return "true" if values[0] else "false"
-    if name in INTEGER_ATTRIBUTES:
-        return str(int(values[0]))
-    if name in _LIST_ATTRIBUTES:
-        # Trailing zeros are omitted, since numbers missing in a list are zero.
-        last_nonzero = max((i for i, value in enumerate(values) if value), default=0)
-        return format_numbers(values[: last_nonzero + 1])
-    return format_numbers(values)
-
-
-EXACT_DIGITS = 17
-"""Number of significant digits with which every float64 number is read back exactly."""
-
-
-def format_spec(spec: Any, folder: Path) -> str:
-    """Format an editable MuJoCo model as MJCF with full precision and absolute asset folders.
-
-    MuJoCo writes six digits by default, which would change the motion. Angles and other values keep
-    the notation of the model file.
-
-    Args:
-        spec: compiled `mujoco.MjSpec`; it must not be used afterwards.
-        folder: folder to which the paths of its assets are relative.
-
-    Returns:
-        The MJCF text.
-
-    Raises:
-        RuntimeError: this MuJoCo library has no function that sets the number of digits.
-    """
-    spec.meshdir = str(folder / spec.meshdir)
-    spec.texturedir = str(folder / spec.texturedir)
-    spec.compiler.savecompiled = False
-    spec.compiler.savecanonical = False
-    # The number of digits is a setting of MuJoCo's library, which is restored afterwards.
-    library = _load_library()
-    try:
-        digits = library._mjPRIVATE__get_xml_precision()
-        library._mjPRIVATE__set_xml_precision(EXACT_DIGITS)
-    except AttributeError:
-        raise RuntimeError("this MuJoCo writes models with six digits only") from None
-    try:
-        return str(spec.to_xml())
-    finally:
-        library._mjPRIVATE__set_xml_precision(digits)
-
-
-@cache
-def _load_library() -> Any:
-    """Load MuJoCo's shared library; its Python module does not expose the number of digits."""
-    import mujoco
-
-    folder = Path(mujoco.__file__).parent
-    patterns = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")  # Linux, macOS, Windows
-    path, *_ = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
-    return ctypes.CDLL(str(path))
-
-
-def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
-    """Return the text of the model file with the elements that causes add, and a fixed base.
-
-    1. For a base that a recording fixes, remove free joints and keyframes.
-    2. Add tendons of coupled drives.
-    3. Add pairs of geoms with contact parameters of their own.
-    4. Add joints in series (second joints of flexible or slack drives).
-
-    Other numbers are written afterwards. Without any of these elements, the text is unchanged.
-
-    Args:
-        robot: robot with the added elements.
-        model: compiled model with the causes.
-
-    Raises:
-        NotEditableError: the text does not contain a required joint, actuator or geom.
-    """
-    text = robot.path.read_bytes()
-    has_fixed_base = robot.engine_table.get("fix_base", False)
-    if not robot.series and not robot.coupled and not has_fixed_base and not robot.spec.pairs:
-        return text
-    document = MjcfDocument(text, robot.path)
-    # 1. As by `parsing.floating_bases.fix_bases`. An element with an empty text is left out.
-    if has_fixed_base:
-        for tag in document.walk():
-            is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
-            if tag.name in ("freejoint", "keyframe") or is_free:
-                tag.text = b""
-    # 2. Tendons.
-    if robot.coupled:
-        _write_couplings(document, robot, model)
-    # 3. Pairs.
-    _add_pairs(document, robot)
-    # 4. Joints in series, each after the joint of its drive.
-    tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
-    for series_joint in (joint for joint in robot.spec.joints if joint.name in robot.series):
-        # Its name is that of the drive's joint and an ending.
-        drive_joint, _, _ = series_joint.name.rpartition("_")
-        joint_tag = tags.get(drive_joint)
-        if joint_tag is None:
-            raise NotEditableError(f"no joint of its text is in series with {series_joint.name}")
-        joint_tag.after.append(_render_series_joint(series_joint))
-    return document.to_text().encode()
-
-
-def _write_couplings(document: MjcfDocument, robot: RobotModel, model: Any) -> None:
-    """Write the couplings of drives: a fixed tendon for each, which the joint's actuators drive.
-
-    The length of the tendon is q + c q_first, with the position q of the drive's joint, that of the
-    preceding joint q_first, and the coefficient c.
-
-    Args:
-        document: the MJCF, changed in place.
-        robot: robot with the couplings.
-        model: compiled model with the causes, which has the coefficients of the couplings.
-
-    Raises:
-        NotEditableError: the text lacks a joint or an actuator of the compiled model.
-    """
-    # Elements of the actuators, in the order of their numbers.
-    tags = [child for tag in document.find_elements("actuator") for child in document.children(tag)]
-    if len(tags) != len(robot.actuators):
-        raise NotEditableError("the compiled model has other actuators")
-    joint_names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
-    for name in robot.coupled:
-        first = find_preceding_joint(robot, name)
-        assert first is not None  # only joints with a preceding one can be coupled
-        if not {name, first.name} <= joint_names:
-            raise NotEditableError(f"no joint of its text is called {name} or {first.name}")
-        c = format_number(float(model.wrap_prm[get_coupling_address(robot, name)]))
-        joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
-        tendon = f'<fixed name="{name}{COUPLING_TENDON_SUFFIX}">{joints}</fixed>'
-        document.root.insert_within(f"<tendon>{tendon}</tendon>")
-        # The actuators of the joint get the tendon as their target.
-        for actuator in (a for a in robot.actuators if a.joint == name):
-            tags[actuator.id].removed |= {"joint", "jointinparent"}
-            tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"
-
-
-def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
-    """Write the elements `<pair>` of a robot that the text lacks.
-
-    A pair states the parameters of one contact; it refers to its geoms by their names.
-
-    Args:
-        document: the MJCF, changed in place.
-        robot: the robot with its pairs.
-
-    Raises:
-        NotEditableError: a geom has no name in the text.
-    """
-    existing_pairs = document.find_pairs()
-    names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "geom"}
-    for pair in robot.spec.pairs:
-        geoms = frozenset((pair.geomname1, pair.geomname2))
-        if geoms in existing_pairs:
-            continue
-        if not geoms <= names:
-            raise NotEditableError(f"a geom of the contact {pair.name} has no name in its text")
-        attributes = {"name": pair.name, "geom1": pair.geomname1, "geom2": pair.geomname2}
-        attributes["condim"] = str(pair.condim)
-        for name in ("friction", "solref", "solimp"):
-            attributes[name] = format_numbers(tuple(getattr(pair, name)))
-        attributes |= {name: format_number(getattr(pair, name)) for name in ("margin", "gap")}
-        pair_text = format_element("pair", attributes)
-        document.root.insert_within(f"<contact>{pair_text}</contact>")
-
-
-def _render_series_joint(second: Any) -> str:
-    """Render a joint that is added in series with another one as an MJCF element.
-
-    All attributes are stated, so that the file's default classes have no influence on it. A limited
-    range represents backlash.
-
-    Args:
-        second: joint of the `mujoco.MjSpec`.
-    """
-    kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
-    is_limited = str(second.limited).endswith("TRUE")
-    attributes = {
-        "name": second.name,
-        "type": kind,
-        "axis": format_numbers(tuple(second.axis)),
-        "pos": format_numbers(tuple(second.pos)),
-        "limited": "true" if is_limited else "false",
-        "actuatorfrclimited": "false",
-    }
-    if is_limited:
-        attributes["range"] = format_numbers(tuple(second.range))
-        attributes["solreflimit"] = format_numbers(tuple(second.solref_limit))
-        attributes["solimplimit"] = format_numbers(tuple(second.solimp_limit))
-    attributes |= dict.fromkeys(("damping", "frictionloss", "armature", "stiffness"), "0")
-    return format_element("joint", attributes)

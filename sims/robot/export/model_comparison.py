@@ -9,6 +9,9 @@ import numpy as np
 _IGNORED_NAME_PARTS = ("name", "path", "text", "signature", "tex_data", "nbuffer")
 """Parts of the names of model fields that do not influence the motion."""
 
+EQUAL_NUMBERS_TOLERANCE = 1e-12
+"""Relative difference between numbers of a compiled model that counts as rounding."""
+
 
 def find_first_difference(first_model: Any, second_model: Any, tolerance: float) -> str | None:
     """Find the first field, in alphabetical order, in which two compiled models differ.

@@ -13,13 +13,9 @@ from sims.core.freed_memory import release_free_memory
 from sims.core.simulator import Array
 from sims.robot.export.apply_causes import apply_causes
 from sims.robot.export.mjcf_attributes import UnstatableCauseError
-from sims.robot.export.model_comparison import find_first_difference
-from sims.robot.export.write_model_file import (
-    EQUAL_NUMBERS_TOLERANCE,
-    CauseCoefficients,
-    WrittenModelFiles,
-)
-from sims.robot.fitted_causes import expand_families
+from sims.robot.export.model_comparison import EQUAL_NUMBERS_TOLERANCE, find_first_difference
+from sims.robot.export.write_model_file import WrittenModelFiles
+from sims.robot.fitted_causes import CauseCoefficients, expand_families
 from sims.robot.inertia_tensors import MIN_MOMENT, compute_inertia_tensors
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_model import RobotModel

@@ -22,22 +22,29 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sims.core.simulator import Array
+from sims.robot.export.apply_causes import COULOMB
 from sims.robot.export.mjcf_attributes import UnstatableCauseError
+from sims.robot.export.mjcf_writer import format_heading
 from sims.robot.export.xml_editing import (
+    NotEditableError,
     XmlElement,
     XmlText,
-    format_heading,
     format_number,
     format_numbers,
 )
-from sims.robot.fitted_causes import FittedCause
+from sims.robot.fitted_causes import CauseCoefficients, FittedCause, expand_families
 from sims.robot.inertia_tensors import compute_point_inertias
-from sims.robot.model_field_effects import add_to_file_value, compute_factor
+from sims.robot.model_field_effects import add_to_file_value, compute_factor, get_write_order
 from sims.robot.robot_model import RobotModel
 
 _TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _NO_INERTIAL = "a link of the body states no inertial"
 """Reason why a change of mass or inertia cannot be written."""
+
+_SOFT_FRICTION_URDF_NOTE = (
+    "friction.coulomb: a URDF cannot state that dry friction is stiff, and MuJoCo reads it in its "
+    "soft form; extended.xml has the stiff form"
+)
 
 
 class UrdfWriter:
@@ -409,3 +416,39 @@ def _compute_rotation(rpy: Array) -> Array:
     """Return the axes (3, 3) rotated about fixed x, y and z in turn, as URDF defines ``rpy``."""
     axes: Array = Rotation.from_euler("xyz", rpy).as_matrix()
     return axes
+
+
+def render_urdf(
+    robot: RobotModel, causes: CauseCoefficients, recording: str, notes: list[str]
+) -> str | None:
+    """Render the URDF with the causes that it can express, and add notes about all others.
+
+    The result is None if its text cannot be edited.
+
+    Args:
+        robot: the robot as read from its URDF.
+        causes: coefficients of all causes.
+        recording: title of the recording, for comments.
+        notes: notes for the user, extended in place.
+    """
+    # Importing scipy.spatial takes 0.1 s, and only robots from a URDF need it.
+
+    try:
+        writer = UrdfWriter(robot, recording)
+    except NotEditableError as unfit:
+        notes.append(f"no URDF is written: {unfit}")
+        return None
+    urdf_notes = []
+    fitted_causes = expand_families(robot, causes)
+    # Some causes, such as a payload, must follow others.
+    for cause in sorted(fitted_causes, key=lambda entry: get_write_order(entry.effect)):
+        try:
+            writer.write(cause)
+        except UnstatableCauseError as reason:
+            urdf_notes.append(f"{cause.format(recording)}: not in the URDF: {reason}")
+            continue
+        if cause.effect == COULOMB and robot.friction_form == "stiff":
+            urdf_notes.append(_SOFT_FRICTION_URDF_NOTE)
+    urdf_notes = list(dict.fromkeys(urdf_notes))  # without repetitions
+    notes += urdf_notes
+    return writer.to_text(urdf_notes)

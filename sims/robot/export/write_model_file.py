@@ -7,47 +7,29 @@ with the same comments.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
-from sims.core.freed_memory import release_free_memory
-from sims.extended_simulator import FittedValue
-from sims.robot.export.apply_causes import (
-    COULOMB,
+from sims.robot.export.apply_causes import ModifiedModel, apply_causes
+from sims.robot.export.mjcf_attributes import (
     KEPT_VALUE_NOTE,
     MAX_CORRECTION_ROUNDS,
     ROUNDING_TOLERANCE,
-    ModifiedModel,
-    apply_causes,
-)
-from sims.robot.export.mjcf_attributes import (
     AttributeStatement,
-    UnstatableCauseError,
     find_missing_statements,
 )
-from sims.robot.export.mjcf_document import MjcfDocument
+from sims.robot.export.mjcf_document import MjcfDocument, compile_mjcf
 from sims.robot.export.mjcf_writer import (
     MjcfWriter,
+    format_heading,
     render_with_added_elements,
 )
-from sims.robot.export.model_comparison import find_first_difference
-from sims.robot.export.xml_editing import NotEditableError, format_heading
-from sims.robot.fitted_causes import expand_families
-from sims.robot.model_field_effects import get_write_order
-from sims.robot.mujoco_messages import capture_mujoco_warnings
-from sims.robot.robot_model import RobotModel
-
-CauseCoefficients = Mapping[str, Mapping[str, FittedValue]]
-"""Coefficients by ``effect@place``, ``effect@*`` or ``effect``."""
-
-EQUAL_NUMBERS_TOLERANCE = 1e-12
-"""Relative difference between numbers of a compiled model that counts as rounding."""
-
-_SOFT_FRICTION_URDF_NOTE = (
-    "friction.coulomb: a URDF cannot state that dry friction is stiff, and MuJoCo reads it in its "
-    "soft form; extended.xml has the stiff form"
+from sims.robot.export.model_comparison import EQUAL_NUMBERS_TOLERANCE, find_first_difference
+from sims.robot.export.xml_editing import (
+    NotEditableError,
 )
+from sims.robot.fitted_causes import CauseCoefficients
+from sims.robot.robot_model import RobotModel
 
 
 @dataclass(frozen=True)
@@ -103,45 +85,13 @@ def write_model_files(
         if robot.format == "mjcf":
             notes.append(f"the MJCF is as MuJoCo writes it, not as {robot.path.name}: {unfit}")
         text = MjcfEditor(applied.robot, applied, recording, applied.text.encode()).to_text()
-    urdf = _render_urdf(robot, causes, recording, notes) if robot.format == "urdf" else None
+    urdf = None
+    if robot.format == "urdf":
+        # This module imports SciPy, which takes long.
+        from sims.robot.export.urdf_writer import render_urdf
+
+        urdf = render_urdf(robot, causes, recording, notes)
     return WrittenModelFiles(text, urdf, tuple(notes), applied)
-
-
-def _render_urdf(
-    robot: RobotModel, causes: CauseCoefficients, recording: str, notes: list[str]
-) -> str | None:
-    """Render the URDF with the causes that it can express, and add notes about all others.
-
-    The result is None if its text cannot be edited.
-
-    Args:
-        robot: the robot as read from its URDF.
-        causes: coefficients of all causes.
-        recording: title of the recording, for comments.
-        notes: notes for the user, extended in place.
-    """
-    # Importing scipy.spatial takes 0.1 s, and only robots from a URDF need it.
-    from sims.robot.export.urdf_writer import UrdfWriter
-
-    try:
-        writer = UrdfWriter(robot, recording)
-    except NotEditableError as unfit:
-        notes.append(f"no URDF is written: {unfit}")
-        return None
-    urdf_notes = []
-    fitted_causes = expand_families(robot, causes)
-    # Some causes, such as a payload, must follow others.
-    for cause in sorted(fitted_causes, key=lambda entry: get_write_order(entry.effect)):
-        try:
-            writer.write(cause)
-        except UnstatableCauseError as reason:
-            urdf_notes.append(f"{cause.format(recording)}: not in the URDF: {reason}")
-            continue
-        if cause.effect == COULOMB and robot.friction_form == "stiff":
-            urdf_notes.append(_SOFT_FRICTION_URDF_NOTE)
-    urdf_notes = list(dict.fromkeys(urdf_notes))  # without repetitions
-    notes += urdf_notes
-    return writer.to_text(urdf_notes)
 
 
 class MjcfEditor:
@@ -224,21 +174,3 @@ class MjcfEditor:
         heading = format_heading(self.robot.path, self.recording, self.applied.notes)
         document.root.within.insert(0, ([heading], ""))
         return document.to_text()
-
-
-def compile_mjcf(text: str) -> Any:
-    """Compile an MJCF text without printing MuJoCo's warnings.
-
-    Raises:
-        NotEditableError: MuJoCo rejects the text.
-    """
-    import mujoco
-
-    try:
-        with capture_mujoco_warnings():
-            model = mujoco.MjSpec.from_string(text).compile()
-    except ValueError as error:
-        raise NotEditableError(f"MuJoCo refuses it: {' '.join(str(error).split())}") from None
-    # The discarded spec held all meshes a second time.
-    release_free_memory()
-    return model

@@ -310,18 +310,6 @@ def _render_attribute(name: str, value: str) -> bytes:
     return f'{name}="{escape(value, {chr(34): "&quot;"})}"'.encode()
 
 
-def format_heading(path: Path, recording: str, notes: Iterable[str]) -> str:
-    """Format the comment at the top of a written file: its origin, and notes.
-
-    Args:
-        path: model file from which it was made.
-        recording: title of the recording to which its causes were fitted; empty if none.
-        notes: a line for each note.
-    """
-    origin = f", with the causes found in {recording}" if recording else ""
-    return "\n     ".join([f"{path.name}{origin}; written by simgap", *notes])
-
-
 def strip_heading(text: str) -> str:
     """Remove the comment at the top of a written file."""
     return re.sub(

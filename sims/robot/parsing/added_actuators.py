@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any, TypedDict
 
 from sims.core import toml_validation
-from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import Range
+from sims.core.user_messages import truncate_text
 
 
 class ActuatorTable(TypedDict, total=False):

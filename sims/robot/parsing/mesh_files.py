@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from sims.core.files import is_existing_file
-from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError
+from sims.core.user_messages import truncate_text
 from sims.robot.mujoco_messages import format_name_list
 from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader
 

@@ -7,7 +7,7 @@ from pathlib import PurePosixPath
 from xml.etree.ElementTree import Element
 
 from sims.core.files import is_existing_file
-from sims.core.plain_values import truncate_text
+from sims.core.user_messages import truncate_text
 from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader, find_children, parse_tree
 
 TEXTURE_FILE_ATTRIBUTES = (

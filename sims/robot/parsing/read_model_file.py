@@ -12,8 +12,9 @@ import numpy as np
 
 from sims.core.files import require_file
 from sims.core.freed_memory import release_free_memory
-from sims.core.plain_values import MAX_NUMBER, truncate_text
+from sims.core.number_limits import MAX_NUMBER
 from sims.core.simulator import InputError
+from sims.core.user_messages import truncate_text
 from sims.robot.integrator_settings import (
     MAX_TIME_STEP,
     MIN_TIME_STEP,
@@ -27,9 +28,9 @@ from sims.robot.mujoco_messages import (
 from sims.robot.parsing import (
     added_actuators,
     collision_filters,
-    element_names,
     floating_bases,
     mjcf_loading,
+    name_repairs,
     urdf_loading,
 )
 from sims.robot.parsing.compile_repairs import CompileRepairs
@@ -137,7 +138,7 @@ def _make_robot(
         InputError: the file cannot be repaired, or the additions are invalid.
     """
     # 1. XML.
-    source, notes = str(files.path), element_names.rename_invalid_names(root)
+    source, notes = str(files.path), name_repairs.rename_invalid_names(root)
     repairs = CompileRepairs(files, OmittedShapes(source))
     if kind == "urdf":
         notes += urdf_loading.repair_urdf(files, root)
@@ -150,7 +151,7 @@ def _make_robot(
     tables_source = str(files.description or source)
     rate_controlled = added_actuators.add_actuators(spec, actuators, tables_source)
     notes += apply_engine_settings(spec, engine, tables_source)
-    notes += element_names.name_unnamed_elements(spec)
+    notes += name_repairs.name_unnamed_elements(spec)
     # A base that is fixed has no joint to replace.
     recorded_bases = () if engine.get("fix_base") else engine.get("recorded_bases", ())
     bases, base_notes = floating_bases.separate_floating_joints(spec, recorded_bases, source)

@@ -10,8 +10,8 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from sims.core.plain_values import truncate_text
 from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.user_messages import truncate_text
 from sims.robot import inertia_tensors
 from sims.robot.dry_friction import FRICTION_SOLIMP
 from sims.robot.mujoco_messages import format_item_list, format_mujoco_error, format_name_list

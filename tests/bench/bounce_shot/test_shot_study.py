@@ -10,26 +10,26 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from bench.api.compare import ComparisonResult
-from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
+from bench.api.comparison_result import ComparisonResult
+from bench.benchmark.problem.experiment_config import list_experiment_names, load_experiment
 from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import PoolLostError
 from bench.benchmark.statistics.proportion_interval import compute_proportion_interval
-from bench.bounce_shot import shot_study, tuned_shots
+from bench.bounce_shot import drop_tuning, shot_study
 from bench.bounce_shot.drop_recording import record_drop
-from bench.bounce_shot.hit_rate_table import ALL_BALLS, build_result_table
-from bench.bounce_shot.shot_config import read_shot_config
-from bench.bounce_shot.shot_execution import execute_shot
-from bench.bounce_shot.shot_sampling import draw_shot, draw_shots
-from bench.bounce_shot.true_world import InclinedGround, simulate_shot
-from bench.bounce_shot.tuned_shots import (
+from bench.bounce_shot.drop_tuning import (
     ShotInputs,
-    TunedModel,
     build_pixel_runs,
     select_transferable_effects,
     tune_and_plan,
 )
+from bench.bounce_shot.hit_rate_table import ALL_BALLS, build_result_table
+from bench.bounce_shot.shot_config import read_shot_config
+from bench.bounce_shot.shot_execution import execute_shot
+from bench.bounce_shot.shot_planner import TunedModel
+from bench.bounce_shot.shot_sampling import draw_shot, draw_shots
+from bench.bounce_shot.true_world import InclinedGround, simulate_shot
 from bench.core.plugin_registries import REGISTRIES
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
@@ -181,7 +181,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
     settings, path = read_shot_config(experiment), tmp_path / "drop.csv"
     assert settings.rows == ("tunenet-vision",)
     watching, metres = (
-        tuned_shots.make_tuning_experiment(experiment, settings, entry)
+        drop_tuning.make_tuning_experiment(experiment, settings, entry)
         for entry in experiment.tuners
     )
     assert (watching.simulator, watching.observe, metres.simulator) == (
@@ -210,7 +210,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
         known = ShotInputs(dealt.name, path, dealt.scene, weights)
         recording = read_recording(path, Ball, whole=True)
         by_rows, by_metres = (
-            tuned_shots._tune_model(experiment, settings, entry, known, recording, {})
+            drop_tuning._tune_model(experiment, settings, entry, known, recording, {})
             for entry in experiment.tuners
         )
         assert by_rows.restitution == pytest.approx(by_metres.restitution, abs=0.06)
@@ -254,7 +254,7 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
     def broken(_):
         return TunedModel("explain", 0.5, {}, 0, 0.0, "crashed", "no"), {}
 
-    monkeypatch.setattr(tuned_shots, "_explain_drop", broken)
+    monkeypatch.setattr(drop_tuning, "_explain_drop", broken)
     settings = read_shot_config(experiment)
     dealt = draw_shot(experiment, settings, "rubber", 1)
     path = tmp_path / "drop.csv"
@@ -346,7 +346,7 @@ def explained(_):
 @pytest.fixture
 def crashing(tmp_path, monkeypatch, fresh_registries):
     """Return the arguments of a study with a failing tuner; explain and figures are stubs."""
-    monkeypatch.setattr(tuned_shots, "_explain_drop", explained)
+    monkeypatch.setattr(drop_tuning, "_explain_drop", explained)
     monkeypatch.setattr("bench.bounce_shot.shot_report.draw_figures", lambda *_: {})
     monkeypatch.setattr("bench.bounce_shot.shot_report.write_animation", lambda *_: "animation")
     path = tmp_path / "mine.toml"
@@ -447,20 +447,20 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
     out = tmp_path / "out"
     path = tmp_path / "mine.toml"
     path.write_text(path.read_text().replace("targets = 1", "targets = 2"))
-    shoot = tuned_shots.tune_and_plan
+    shoot = drop_tuning.tune_and_plan
 
     def interrupted(experiment, settings, known):
         if known.name.endswith("001"):
             raise KeyboardInterrupt
         return shoot(experiment, settings, known)
 
-    monkeypatch.setattr(tuned_shots, "tune_and_plan", interrupted)
+    monkeypatch.setattr(drop_tuning, "tune_and_plan", interrupted)
     said = run_command("compare", *crashing, "--out", out, code=130)
     assert "simgap: interrupted; 1 of 2 shots are made and stored" in said.err
     assert f"simgap: to finish: simgap compare --resume {out}" in said.err
     assert len(pd.read_csv(out / "status.csv")) == 6, "what there is is reported"
     assert "missing    golf-001" in run_command("status", out, code=1).out
-    monkeypatch.setattr(tuned_shots, "tune_and_plan", shoot)
+    monkeypatch.setattr(drop_tuning, "tune_and_plan", shoot)
     first = (out / "shots" / "golf-000.json").read_bytes()
 
     def resumed(*options, code=0):

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("av")
 pytest.importorskip("cv2")
 
-from bench.logs import film_tracking
+from bench.logs import ball_heights_from_film
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
 from sims.systems.ball import BallSystem
@@ -56,7 +56,7 @@ def test_a_picture_that_cannot_be_drawn_leaves_nothing_behind(drop, tmp_path):
         raise RuntimeError("out of paint")
 
     with pytest.raises(RuntimeError, match="out of paint"):
-        film_tracking.track_film(drop / "drop.mp4", tmp_path / "t.csv", broken)
+        ball_heights_from_film.track_film(drop / "drop.mp4", tmp_path / "t.csv", broken)
     assert not list(tmp_path.iterdir())
 
 

@@ -9,9 +9,13 @@ import pytest
 import tomli_w
 
 from bench.api.train import DEFAULT_EXPERIMENTS, LossRecorder, default_experiment, select_training
-from bench.benchmark.problem.experiment import TunerEntry, list_experiment_names, load_experiment
+from bench.benchmark.problem.experiment_config import (
+    TunerEntry,
+    list_experiment_names,
+    load_experiment,
+)
 from bench.benchmark.runner.trained_weights import WeightsError
-from bench.benchmark.runner.tuner_process_reuse import make_tuner_spec
+from bench.benchmark.runner.tuner_process_start import make_tuner_spec
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
     compute_training_key,

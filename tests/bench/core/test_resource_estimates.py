@@ -8,7 +8,7 @@ import pytest
 import tomli_w
 
 import simgap
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.runner.comparison_resources import (
     check_comparison_size,
     estimate_comparison_need,

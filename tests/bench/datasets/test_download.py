@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
+from bench.benchmark.problem.experiment_config import list_experiment_names, load_experiment
 from bench.benchmark.problem.missing_requirements import availability
-from bench.datasets import dataset_catalogue
-from bench.datasets.dataset_catalogue import SourceFile
+from bench.datasets import public_datasets
+from bench.datasets.public_datasets import SourceFile
 from sims.recording.recording import read_recording
 from sims.systems.pendulum import Pendulum
 from tests.command_output import run_command
@@ -58,9 +58,9 @@ def repository(tmp_path, monkeypatch):
         SourceFile(path, len(data), hashlib.sha256(data).hexdigest())
         for path, data in files.items()
     )
-    made = replace(dataset_catalogue.get("pendulum_free_swing"), files=declared)
-    every = {**dataset_catalogue._read_catalogue(), made.name: made}
-    monkeypatch.setattr(dataset_catalogue, "_read_catalogue", lambda: every)
+    made = replace(public_datasets.get("pendulum_free_swing"), files=declared)
+    every = {**public_datasets._read_catalogue(), made.name: made}
+    monkeypatch.setattr(public_datasets, "_read_catalogue", lambda: every)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
     monkeypatch.delenv("SIMGAP_DATA", raising=False)
     monkeypatch.delenv("SIMGAP_ROBOTS", raising=False)
@@ -123,7 +123,7 @@ def refused(*words):
     said = run_command("download", "pendulum_free_swing", *words, code=2)
     assert said.out == ""
     assert len(said.err.splitlines()) == 1, said.err
-    folder = dataset_catalogue.get_user_folder()
+    folder = public_datasets.get_user_folder()
     assert not folder.exists() or not list(folder.iterdir())
     return said.err
 
@@ -137,7 +137,7 @@ def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path)
     assert {path.name for path in folder.iterdir()} == names
     assert (folder / "LICENSE").read_bytes() == LICENCE
     source = (folder / "SOURCE.txt").read_text()
-    made = dataset_catalogue.get("pendulum_free_swing")
+    made = public_datasets.get("pendulum_free_swing")
     assert all(word in source for word in (made.commit, made.repository, made.files[0].sha256))
     recording = read_recording(folder / "recording.csv", Pendulum)
     assert len(recording.runs) == 2
@@ -149,7 +149,7 @@ def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path)
 
 
 def test_runs_from_the_seventh_on_are_held_out():
-    from bench.datasets.dataset_download import free_swing
+    from bench.datasets.public_datasets import free_swing
 
     swing = np.stack([np.linspace(3.0, 3.2, 40_000), np.linspace(-1.0, 1.0, 40_000)])
     content = io.BytesIO()
@@ -221,7 +221,7 @@ def test_no_network(repository, monkeypatch):
     said = refused()
     assert "cannot be downloaded" in said
     assert "Name or service not known" in said
-    assert f"{dataset_catalogue.get('pendulum_free_swing').base_url}/{MAT}" in said
+    assert f"{public_datasets.get('pendulum_free_swing').base_url}/{MAT}" in said
 
 
 @pytest.mark.parametrize(
@@ -278,7 +278,7 @@ def test_a_folder_that_cannot_be_written(repository, tmp_path):
 
 @pytest.mark.parametrize("content", [b"", b"MATLAB 5.0 MAT-file" * 20, None])
 def test_a_file_of_other_content_is_no_recording(content):
-    from bench.datasets.dataset_download import free_swing
+    from bench.datasets.public_datasets import free_swing
     from sims.core.simulator import InputError
 
     if content is None:
@@ -326,7 +326,7 @@ def test_the_published_swing_is_the_recording_that_results_were_made_with(record
     published = os.environ.get("SIMGAP_FREE_SWING")
     if not published:
         pytest.skip("SIMGAP_FREE_SWING does not name the published file")
-    from bench.datasets.dataset_download import free_swing
+    from bench.datasets.public_datasets import free_swing
 
     for name, content in free_swing({"x.mat": Path(published).read_bytes()}).items():
         assert content == (recordings / "pendulum_free_swing" / name).read_text(), name
@@ -335,7 +335,7 @@ def test_the_published_swing_is_the_recording_that_results_were_made_with(record
 def test_data_sets_are_those_that_results_were_made_with(recordings):
     robots = recordings.parent / "robots"
     for data_set, folder in (("so101", robots), ("pendulum_free_swing", recordings)):
-        for file in dataset_catalogue.get(data_set).files:
+        for file in public_datasets.get(data_set).files:
             path = folder / data_set / file.name
             if not path.is_file():
                 continue  # converted files are compared in the test above

@@ -9,7 +9,7 @@ from bench.core.plugin_registries import simulators
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.logs.synthetic_recording import simulate_recording
 from sims.core.simulator import Scenario

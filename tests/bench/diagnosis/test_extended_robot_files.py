@@ -8,14 +8,11 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.explanation import Explanation
-from bench.diagnosis.extended_robot_files import (
-    ExtendedRobotFiles,
-    build_robot_files,
-    collect_causes,
-)
+from bench.diagnosis.extended_robot_files import ExtendedRobotFiles, build_robot_files
 from bench.diagnosis.score_extended import score_model
 from sims.extended_simulator import ExtendedSimulator, FittedValue, get_robot_reference
 from sims.robot.export import round_trip_check
+from sims.robot.fitted_causes import collect_causes
 from sims.robot.integrator_settings import IntegratorSettings
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import make_robot_simulator as robot_simulator

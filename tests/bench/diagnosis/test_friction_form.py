@@ -11,21 +11,23 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.diagnosis import friction_form_verdict
+from bench.diagnosis.dry_friction_form import (
+    get_friction_form,
+    has_dry_friction,
+    make_soft_kind,
+)
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.fitting.fitted_models import ModelSet
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.friction_form_verdict import (
-    choose_friction_form,
-    get_friction_form,
-    has_dry_friction,
-    make_soft_kind,
-)
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.pipeline import cause_search
-from bench.diagnosis.prediction_error.dry_friction_fits import SoftFrictionError
+from bench.diagnosis.prediction_error import dry_friction_fits
+from bench.diagnosis.prediction_error.dry_friction_fits import (
+    SoftFrictionError,
+    choose_friction_form,
+)
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult
@@ -188,8 +190,8 @@ def test_a_soft_form_that_is_likelier_must_leave_a_smaller_residual(
         )
 
     soft = make_model(soft_cost, 50.0)
-    monkeypatch.setattr(friction_form_verdict, "_refit_with_other_form", lambda *_: soft)
-    chosen = friction_form_verdict.choose_friction_form(None, make_model(100.0, 0.0), None, 10.0)
+    monkeypatch.setattr(dry_friction_fits, "_refit_with_other_form", lambda *_: soft)
+    chosen = dry_friction_fits.choose_friction_form(None, make_model(100.0, 0.0), None, 10.0)
     assert (chosen is soft) == is_soft
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.diagnosis.pipeline.held_out_gains import HeldOutGains
+from bench.diagnosis.pipeline.held_out_gap_closed import HeldOutGains
 
 CHANNELS = {"q.base.x": "m", "q.base.qw": "1", "q.wheel": "rad", "tau.wheel": "N m"}
 SIGMA = np.array([0.01, 0.01, 0.002, 0.1])

@@ -7,11 +7,9 @@ import pytest
 
 from bench.diagnosis import identifiability
 from bench.diagnosis.explain import explain
-from bench.diagnosis.identifiability import (
-    _IdentifiabilityAssessment,
-    check_identifiability,
-    format_identifiability,
-)
+from bench.diagnosis.identifiability import _IdentifiabilityAssessment, check_identifiability
+from bench.diagnosis.report import identifiability_section
+from bench.diagnosis.report.identifiability_section import format_identifiability
 from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
@@ -99,7 +97,7 @@ def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path):
 
 
 def test_of_many_causes_the_surest_are_listed_and_the_others_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr(identifiability, "MAX_LISTED_CAUSES", 3)
+    monkeypatch.setattr(identifiability_section, "MAX_LISTED_CAUSES", 3)
     numbers = check_identifiability(recorded(tmp_path))
     causes = [n for n in numbers if not n.free]
     lines = format_identifiability(numbers)

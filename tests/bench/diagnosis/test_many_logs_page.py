@@ -6,11 +6,12 @@ from dataclasses import replace
 import pytest
 
 from bench.diagnosis import many_logs
-from bench.diagnosis.many_logs import LogResult, format_log_table
-from bench.diagnosis.many_logs_page import (
+from bench.diagnosis.many_logs import (
     MAX_PANELS,
     BatchPageInput,
+    LogResult,
     draw_summary_figure,
+    format_log_table,
     make_summary_charts,
     render_summary_page,
 )

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from bench.core.plugin_registries import load_plugins
 from bench.diagnosis.evaluation import parameter_bounds
 from bench.diagnosis.evaluation.parameter_bounds import bound_of, compute_coefficient_bounds
-from bench.diagnosis.evaluation.plausible_ranges import adapt_to_time_scale
+from bench.diagnosis.evaluation.time_scaled_ranges import adapt_to_time_scale
 from bench.diagnosis.explain import explain
 from bench.diagnosis.extended_robot_files import select_written_causes
 from bench.diagnosis.report.report_data import ParameterChange

@@ -7,13 +7,12 @@ import mujoco
 import pytest
 
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
-from bench.diagnosis.evaluation.solver_option_ranking import rank_option_alternatives
 from bench.diagnosis.explain import explain
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.pipeline.recording_preparation import prepare_runs
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext
-from bench.diagnosis.pipeline.solver_option_choice import RatedOptions
-from bench.diagnosis.report.effect_and_unit_text import format_effect
+from bench.diagnosis.pipeline.solver_option_choice import RatedOptions, rank_option_alternatives
+from bench.diagnosis.report.cause_and_value_text import format_effect
 from sims.robot.integrator_settings import OPTION_EFFECTS, IntegratorSettings
 from tests.bench.diagnosis.block_recordings import BLOCK, OPTIONS, write_block_recording
 

@@ -6,7 +6,7 @@ from dataclasses import FrozenInstanceError, replace
 import pytest
 
 from bench.diagnosis.experiment_design.discriminating_run import DiscriminatingRun
-from bench.diagnosis.report.effect_and_unit_text import format_fitted_value
+from bench.diagnosis.report.cause_and_value_text import format_fitted_value
 from bench.diagnosis.search.verdict_rules import VERDICT_MEANINGS
 from bench.diagnosis.verdict import Candidate, Cause, HeldOutResult, Verdict, to_finite_or_none
 from sims.extended_simulator import FittedValue

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from scipy.stats import beta
 
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.diagnosis_benchmark.diagnoser_figures import (
     DiagnoserReportData,
     draw_chart_figures,
     draw_confusion_matrices,
 )
-from bench.diagnosis_benchmark.diagnoser_page import render_page
+from bench.diagnosis_benchmark.diagnoser_report import render_page
 from bench.diagnosis_benchmark.diagnoser_training import read_training_costs
 from bench.diagnosis_benchmark.result_tables import (
     build_all_tables,
     build_failure_table,
     read_table,
 )
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.figure_output import render_all_formats
-from bench.figures.style import make_panel_grid
 from bench.pages.text_format import format_percent
 from tests.browser import Opened
 from tests.docs.documentation_pages import ROOT

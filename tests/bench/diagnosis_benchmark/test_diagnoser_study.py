@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import simgap
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.core.plugin_registries import REGISTRIES
 from bench.diagnosis_benchmark.answer_store import ANSWERS_FILE, AnswerStore, read_answers
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (

@@ -12,20 +12,15 @@ import pytest
 
 from bench.core.diagnoser import DiagnosisCase, list_observable_effects
 from bench.core.plugin_registries import make_robot_simulator
-from bench.diagnosis_benchmark.case_generation.recording_conditions import (
-    BenchmarkCase,
-    RequestedConditions,
-)
-from bench.diagnosis_benchmark.case_set import list_coefficient_names, render_recording, write_case
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.effect_coefficients import list_coefficient_names
+from bench.diagnosis_benchmark.case_generation.recording_conditions import RequestedConditions
+from bench.diagnosis_benchmark.case_set import render_recording, write_case
 from bench.diagnosis_benchmark.diagnosers.regression_evidence import RegressionEvidence
 from bench.diagnosis_benchmark.grading import _count_classes, grade_answer
 from bench.diagnosis_benchmark.machine_cases.arm_model_file import (
     MODEL_FILE_NAME,
     render_arm_mjcf,
-)
-from bench.diagnosis_benchmark.machine_cases.hidden_causes import (
-    EFFECTS_BY_MACHINE,
-    list_effect_places,
 )
 from bench.diagnosis_benchmark.machine_cases.machine_case_sampling import (
     draw_case,
@@ -35,6 +30,10 @@ from bench.diagnosis_benchmark.machine_cases.machine_dynamics import (
     MACHINES,
     ArmDynamics,
     ServoDynamics,
+)
+from bench.diagnosis_benchmark.machine_cases.machine_effect_coefficients import (
+    EFFECTS_BY_MACHINE,
+    list_effect_places,
 )
 from bench.diagnosis_benchmark.machine_cases.machine_simulation import (
     MachineRuns,

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.comparison_charts import AxisLabels
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.storage.result_folder import StoredComparison
 
 LABELS = AxisLabels("z [m]", "restitution")

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from bench.benchmark import comparison_figures
-from bench.benchmark.comparison_figures import (
+from bench.benchmark import comparison_printed_figures
+from bench.benchmark.comparison_printed_figures import (
     FIGURE_FILES,
     draw_figure,
     list_figure_names,
@@ -102,7 +102,7 @@ def test_statistics_are_computed_once_for_several_figures(monkeypatch):
     def again(_):
         raise AssertionError("computed again")
 
-    monkeypatch.setattr(comparison_figures, "ComparisonStatistics", again)
+    monkeypatch.setattr(comparison_printed_figures, "ComparisonStatistics", again)
     for name in ("runtime", "cost", "amortisation"):
         draw_figure(whole, LABELS, name, statistics)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.figure_output import encode_png, render_png
-from bench.figures.style import make_panel_grid
 
 
 def test_pixels_and_dots_an_inch_are_kept():

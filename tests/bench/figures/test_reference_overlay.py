@@ -7,9 +7,10 @@ import shutil
 import numpy as np
 import pytest
 
-from bench.benchmark.comparison_figures import draw_figure
+from bench.benchmark.comparison_printed_figures import draw_figure, make_reference_id
 from bench.benchmark.storage.reference_results import find_reference, list_reference_names
-from bench.figures.style import ERROR_FLOOR, REFERENCE_GREYS, make_reference_id
+from bench.benchmark.storage.table_schemas import ERROR_FLOOR
+from bench.figures.style import REFERENCE_GREYS
 from sims.core.simulator import InputError
 from tests.bench.figures.sample_comparisons import BUDGET, LABELS, stored
 

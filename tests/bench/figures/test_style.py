@@ -12,21 +12,18 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import bench
-from bench.benchmark.comparison_figures import (
-    draw_critical_difference_figure,
-    draw_figure,
-    list_figure_names,
-)
+from bench.benchmark.comparison_printed_figures import draw_figure, list_figure_names
 from bench.benchmark.statistics.tuner_ranking import compute_nemenyi_p_values
 from bench.diagnosis.report import explanation_figures
 from bench.figures import figure_output, loss_figure, style
 from bench.figures.ball_track_figure import draw_track_figure
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.figure_output import render_all_formats, render_png, write_figure
 from bench.figures.figure_settings import pdf_figures
 from bench.figures.recording_figure import draw_recording_figure
-from bench.figures.style import make_panel_grid
-from bench.logs.ball_heights import BallHeights
+from bench.logs.ball_heights_from_film import BallHeights
 from bench.logs.recording_loading import load_recording
+from bench.suite.multi_problem_report import draw_critical_difference_figure
 from sims.core.simulator import InputError
 from sims.vision.ball_tracker import BallTrack
 from tests.bench.diagnosis.report_tables import swing, table

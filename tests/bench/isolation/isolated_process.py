@@ -6,9 +6,9 @@ import pytest
 
 from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
 from bench.benchmark.isolation.tuner_processes import TunerSpec
-from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.runner import tuner_process_reuse
-from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.runner import tuner_process_start
+from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
 from bench.benchmark.runner.tuner_training import TrainingRequest
 from tests.conftest import PLUGINS
@@ -20,7 +20,7 @@ PROBE = str(PLUGINS / "probe.py")
 def run_isolated(code, files=(), memory=0):
     """Run code in an isolated process and return its result as text."""
     tuned = TunerSpec("probe", "", PROBE, {"code": code})
-    house = tuner_process_reuse.get_fork_server()
+    house = tuner_process_start.get_fork_server()
     child = house.start_process(
         "bench.benchmark.isolation.tuner_server:serve_requests", [PROBE, *map(str, files)], memory
     )
@@ -52,7 +52,7 @@ def _run(child, tuned):
 
 def held():
     """Return the isolation layers that are active on this machine."""
-    child = tuner_process_reuse.get_fork_server().start_process(
+    child = tuner_process_start.get_fork_server().start_process(
         "bench.benchmark.isolation.tuner_server:serve_requests"
     )
     child.wait_until_ready()
@@ -79,10 +79,10 @@ def outcome(experiment, seed=0, target=0):
     (entry,) = experiment.tuners
     target_data = get_problem(experiment).draw_targets()[target].blinded
     order = RunRequest("run", entry, seed, target_data, experiment.budget)
-    return execute_run(experiment, replace(order, tuned=tuner_process_reuse.make_tuner_spec(entry)))
+    return execute_run(experiment, replace(order, tuned=tuner_process_start.make_tuner_spec(entry)))
 
 
 def make_training_request(name, **options):
     """Return a training request for a registered tuner."""
     entry = TunerEntry(name, name, options)
-    return TrainingRequest(entry, 0, tuner_process_reuse.make_tuner_spec(entry))
+    return TrainingRequest(entry, 0, tuner_process_start.make_tuner_spec(entry))

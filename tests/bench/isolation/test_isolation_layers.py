@@ -155,13 +155,13 @@ def test_nothing_is_open_but_its_pipes():
 
 
 def test_its_environment_tells_of_nothing_but_the_machine(monkeypatch):
-    from bench.benchmark.runner import tuner_process_reuse
+    from bench.benchmark.runner import tuner_process_start
 
-    tuner_process_reuse.close_isolated_processes()
+    tuner_process_start.close_isolated_processes()
     monkeypatch.setenv("SECRET_TRUTH", "0.25")
     monkeypatch.setenv("SIMGAP_DATA", "/data")
     names = set(eval(run_isolated("import os\nsorted(os.environ)")))
-    tuner_process_reuse.close_isolated_processes()
+    tuner_process_start.close_isolated_processes()
     known = {"PATH", "LANG", "LC_ALL", "LC_CTYPE", "LD_LIBRARY_PATH", "HOME", "TMPDIR"}
     # SIMGAP_COMPILED is the folder of compiled integration steps.
     known |= {"CUDA_VISIBLE_DEVICES", "PYTHONDONTWRITEBYTECODE", "SIMGAP_COMPILED"}

@@ -14,9 +14,9 @@ import pytest
 
 from bench.benchmark.isolation.process_errors import KilledExternallyError
 from bench.benchmark.isolation.temporary_folders import create_locked_folder, remove_stale_folders
-from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.runner import retry_after_kill, tuner_process_reuse
-from bench.benchmark.runner.plugin_discovery import inspect_plugins, load_plugins_for_experiment
+from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.runner import retry_after_kill, tuner_process_start
+from bench.benchmark.runner.plugin_inspection import inspect_plugins, load_plugins_for_experiment
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
 from bench.benchmark.runner.trained_weights import read_weights
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
@@ -60,7 +60,7 @@ def slow(tmp_path, spring, fresh_registries):
     path.write_text(SLOW)
     experiment = spring_experiment(budget=4, training_budget=5, simulator=spring.name)
     yield experiment, str(path)
-    tuner_process_reuse.close_isolated_processes()
+    tuner_process_start.close_isolated_processes()
 
 
 class Killing:
@@ -100,7 +100,7 @@ def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     assert [tuner["name"] for tuner in known[0].parts] == ["slow"]
     load_plugins_for_experiment([path], experiment)
     entry = TunerEntry("slow", "slow")
-    lesson = TrainingRequest(entry, 0, tuner_process_reuse.make_tuner_spec(entry))
+    lesson = TrainingRequest(entry, 0, tuner_process_start.make_tuner_spec(entry))
     undisturbed = read_weights(train_or_load(experiment, lesson, anew=True).path)
     with Killing(what) as killing:
         disturbed = read_weights(train_or_load(experiment, lesson, anew=True).path)
@@ -109,7 +109,7 @@ def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     weights = train_or_load(experiment, lesson).path
     target = get_problem(experiment).draw_targets()[0].blinded
     order = RunRequest(
-        "run", entry, 0, target, 4, weights, tuner_process_reuse.make_tuner_spec(entry)
+        "run", entry, 0, target, 4, weights, tuner_process_start.make_tuner_spec(entry)
     )
     undisturbed = execute_run(experiment, order).trace
     with Killing(what) as killing:
@@ -130,9 +130,9 @@ def test_a_check_of_the_isolation_is_repeated_as_often_as_a_run(monkeypatch, kil
             case held:
                 return held
 
-    monkeypatch.setattr(tuner_process_reuse, "_find_active_layers", looked)
+    monkeypatch.setattr(tuner_process_start, "_find_active_layers", looked)
     # Call the undecorated function, because another test may have cached its result.
-    look = tuner_process_reuse.list_active_isolation_layers.__wrapped__
+    look = tuner_process_start.list_active_isolation_layers.__wrapped__
     if kills < retry_after_kill.MAX_RETRIES:
         assert look() == ("process",)
     else:
@@ -144,8 +144,8 @@ def test_a_check_of_the_isolation_is_repeated_as_often_as_a_run(monkeypatch, kil
 
 ALONE = """
 import sys, time
-from bench.benchmark.runner import retry_after_kill, tuner_process_reuse
-tuner_process_reuse.get_fork_server()
+from bench.benchmark.runner import retry_after_kill, tuner_process_start
+tuner_process_start.get_fork_server()
 print("there", flush=True)
 time.sleep(60)
 """

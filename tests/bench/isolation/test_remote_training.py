@@ -5,8 +5,8 @@ import pytest
 
 from bench.benchmark.isolation.process_errors import KilledExternallyError, RunEndedError
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
-from bench.benchmark.runner import tuner_process_reuse
-from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner import tuner_process_start
+from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 from bench.benchmark.runner.trained_weights import read_weights
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.core.plugin_registries import tuners
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path / "cache"))
     yield tmp_path / "cache"
-    tuner_process_reuse.close_isolated_processes()
+    tuner_process_start.close_isolated_processes()
 
 
 @pytest.fixture
@@ -200,7 +200,7 @@ def test_an_installed_tuner_of_another_package_is_isolated_too(tmp_path, monkeyp
     monkeypatch.setattr(
         tuners, "_entry_points", {e.name: e for e in metadata.entry_points(group="simgap.tuners")}
     )
-    tuner_process_reuse.close_isolated_processes()
+    tuner_process_start.close_isolated_processes()
     made = spring_experiment(tuners={"theirs": {}, "random": {}}, targets=1, ranges=["in"], seeds=1)
     load_plugins_for_experiment([], made)
     results = prepare_experiment(made)

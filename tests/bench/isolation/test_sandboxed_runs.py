@@ -4,9 +4,9 @@ import numpy as np
 import psutil
 import pytest
 
-from bench.benchmark.problem.experiment import TunerEntry
-from bench.benchmark.runner import tuner_process_reuse
-from bench.benchmark.runner.tuner_loop import ProposalEvaluator
+from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.problem.tuning_problem import ProposalEvaluator
+from bench.benchmark.runner import tuner_process_start
 from tests.bench.isolation.isolated_process import experiment, outcome
 from tests.kill_and_resume import below
 
@@ -16,9 +16,9 @@ pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 @pytest.fixture(autouse=True)
 def no_process_is_left():
     # Tests of other files may have left idle processes that wait for further runs.
-    tuner_process_reuse.close_isolated_processes()
+    tuner_process_start.close_isolated_processes()
     yield
-    tuner_process_reuse.close_isolated_processes()
+    tuner_process_start.close_isolated_processes()
     assert not below([psutil.Process()], "tuner")
 
 

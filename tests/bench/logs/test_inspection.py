@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 
 from bench.figures.signal_thinning import thin_signal
-from bench.logs.quality.noise_estimation import count_gaps, estimate_noise
 from bench.logs.recording_loading import load_recording
 from bench.logs.recording_summary import format_summary
+from sims.core.noise_estimation import count_gaps, estimate_noise
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
 from sims.systems.servo import Servo

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.logs.quality.pose_check import find_overlaps
+from bench.logs.quality.pose_checks import find_overlaps
 from bench.logs.recording_loading import load_recording
 from tests.bench.diagnosis.simulated_logs import describe, write_log
 from tests.command_output import run_command

@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.misspecification import misspecification_scores
-from bench.misspecification.misspecification_scores import compute_joint_ranks
+from bench.misspecification import misspecification_statistics
+from bench.misspecification.misspecification_statistics import compute_joint_ranks
 from tests.benchmarks.domain_randomisation import halves
 from tests.benchmarks.misspecification_tables import FIT, lines
 from tests.docs.documentation_pages import ROOT
@@ -76,7 +76,7 @@ def test_learned_tuners_and_their_intervals_are_as_measured():
 def test_a_pair_whose_p_value_is_zero_is_significant(monkeypatch):
     p_values = pd.DataFrame([[1.0, 0.0, 0.2], [0.0, 1.0, 0.04], [0.2, 0.04, 1.0]])
     monkeypatch.setattr(
-        misspecification_scores, "compute_nemenyi_p_values", lambda _: (0.01, p_values)
+        misspecification_statistics, "compute_nemenyi_p_values", lambda _: (0.01, p_values)
     )
     found = compute_joint_ranks(pd.read_csv(FOLDER / "ranks.csv"), "param_error")
     tuner_count = found.ranked["plain"].shape[1]

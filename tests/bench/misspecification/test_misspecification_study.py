@@ -13,24 +13,24 @@ import pandas as pd
 import pytest
 
 import simgap
-from bench.benchmark.problem.experiment import (
+from bench.benchmark.problem.experiment_config import (
     Experiment,
     expand_sweep,
     load_experiment,
     parse_experiment,
 )
-from bench.benchmark.problem.recording_observations import make_scenario
+from bench.benchmark.problem.experiment_recording import make_scenario
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.study_base import prepare_study
 from bench.core.plugin_registries import simulators
-from bench.misspecification import misspecification_scores
-from bench.misspecification.calibration import MODEL_LABELS, write_calibration_recording
+from bench.misspecification import misspecification_statistics
+from bench.misspecification.calibration_recording import MODEL_LABELS, write_calibration_recording
 from bench.misspecification.misspecification_study import (
     MisspecificationStudy,
     make_base_experiment,
     make_extended_experiment,
 )
-from bench.studies.study import begin_studies, get_study_class
+from bench.studies.study_kinds import begin_studies, get_study_class
 from sims import extended_simulator as extending
 from sims.core.simulator import InputError
 from sims.recording.recording import read_recording
@@ -165,26 +165,30 @@ def test_it_is_reported_in_words_tables_and_figures(folder):
 
 
 def test_failures_count_and_rank_last(folder):
-    one = misspecification_scores.load_scores(folder, small())
+    one = misspecification_statistics.load_scores(folder, small())
     spoilt = one.errors.copy()
     first = (spoilt["model"] == "plain") & (spoilt["tuner"] == "least_squares")
     row = spoilt.index[first][0]
     spoilt.loc[
         row,
         [
-            misspecification_scores.PARAMETERS,
-            misspecification_scores.PREDICTION,
+            misspecification_statistics.PARAMETERS,
+            misspecification_statistics.PREDICTION,
             "restitution",
             "|restitution|",
         ],
     ] = np.nan
     spoilt.loc[row, "failures"] = 1
     broken = replace(one, errors=spoilt)
-    ranks = misspecification_scores.build_rank_table(broken).set_index(["metric", "tuner"])["plain"]
-    whole = misspecification_scores.build_rank_table(one).set_index(["metric", "tuner"])["plain"]
-    key = (misspecification_scores.PARAMETERS, "least_squares")
+    ranks = misspecification_statistics.build_rank_table(broken).set_index(["metric", "tuner"])[
+        "plain"
+    ]
+    whole = misspecification_statistics.build_rank_table(one).set_index(["metric", "tuner"])[
+        "plain"
+    ]
+    key = (misspecification_statistics.PARAMETERS, "least_squares")
     assert ranks[key] > whole[key]
-    lines = misspecification_scores.build_score_table(broken)
+    lines = misspecification_statistics.build_score_table(broken)
     counted = lines[(lines["model"] == "plain") & (lines["tuner"] == "least_squares")]
     assert set(counted["failures"]) == {1}
     assert np.isfinite(counted["mean"]).all(), "of the targets that are left"
@@ -283,20 +287,20 @@ def test_a_calibration_that_cannot_be_is_refused(tmp_path, change, message):
 
 
 def test_targets_that_not_all_have_met_are_left_out(folder):
-    one = misspecification_scores.load_scores(folder, small()).errors
+    one = misspecification_statistics.load_scores(folder, small()).errors
     lacking = one.drop(one.index[(one["target"] == "in-001") & (one["model"] == "extended")][0])
-    assert set(misspecification_scores._select_complete_targets(one)["target"]) == {
+    assert set(misspecification_statistics._select_complete_targets(one)["target"]) == {
         "in-000",
         "in-001",
         "in-002",
     }
-    left = misspecification_scores._select_complete_targets(lacking)
+    left = misspecification_statistics._select_complete_targets(lacking)
     assert set(left["target"]) == {"in-000", "in-002"}
     assert len(left) == 2 * 2 * 2
     # A target with a missing seed counts as incomplete.
     seeds = one.assign(runs=3)
     seeds.loc[seeds.index[0], "runs"] = 2
-    assert set(misspecification_scores._select_complete_targets(seeds)["target"]) == {
+    assert set(misspecification_statistics._select_complete_targets(seeds)["target"]) == {
         "in-001",
         "in-002",
     }

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.figures import figure_output, style
+from bench.figures import figure_layout, figure_output, style
 from bench.pages.chart import (
     Axis,
     AxisSpan,
@@ -51,7 +51,7 @@ def notes():
 
 
 def make_printed_figure():
-    figure, axes = style.make_panel_grid(1, 1, (5.5, 4.6))
+    figure, axes = figure_layout.make_panel_grid(1, 1, (5.5, 4.6))
     axes[0, 0].plot(STEPS, np.sqrt(STEPS), color=style.BLUE)
     return PrintedFigure(
         figure_output.render_svg(figure),

@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark import comparison_figures
+from bench.benchmark import comparison_printed_figures
 from bench.benchmark.comparison_charts import ComparisonView
-from bench.benchmark.comparison_page import (
+from bench.benchmark.comparison_report import (
     ComparisonReportData,
     render_page,
 )
@@ -99,8 +99,8 @@ def shown():
         experiment=replace(whole.experiment, title=TITLE), statuses=statuses(whole)
     )
     # One image is used for all figures, because the tests of figures draw each of them.
-    drawn = render_all_formats(comparison_figures.draw_figure(whole, LABELS, "runtime"))
-    return results(whole, dict.fromkeys(comparison_figures.list_figure_names(whole), drawn))
+    drawn = render_all_formats(comparison_printed_figures.draw_figure(whole, LABELS, "runtime"))
+    return results(whole, dict.fromkeys(comparison_printed_figures.list_figure_names(whole), drawn))
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +201,7 @@ def test_a_tuner_whose_runs_all_crashed_is_last_and_marked_everywhere():
     assert "tunenet" not in best_table(held)
     assert "all runs failed: tunenet." in conclusions(held)[0]
     assert list(dict.fromkeys(held.tables["table"]["tuner"])) == ["random", "tunenet"]
-    drawn = comparison_figures.draw_figure(whole, LABELS, "error")
+    drawn = comparison_printed_figures.draw_figure(whole, LABELS, "error")
     labels = [text.get_text() for text in drawn.legends[0].get_texts()]
     assert labels == ["random", "tunenet\nall runs failed"]
 

@@ -4,14 +4,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.proportion_interval import compute_proportion_interval
 from bench.benchmark.statistics.tuner_ranking import MIN_PROBLEMS_FOR_RANKS
 from bench.bounce_shot.hit_rate_table import build_result_table
 from bench.bounce_shot.shot_report import render_page
+from bench.figures.figure_layout import make_panel_grid
 from bench.figures.figure_output import render_all_formats
-from bench.figures.style import make_panel_grid
 from bench.suite.multi_problem_report import (
     ComparisonCollection,
     render_multi_problem_page,

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.experiment import load_experiment
-from bench.benchmark.problem.experiment_tables import TunerEntry
+from bench.benchmark.problem.experiment_config import TunerEntry, load_experiment
 from bench.benchmark.problem.training_simulator import (
     NO_EFFECT_SHARE,
     CountedTrainingSimulator,

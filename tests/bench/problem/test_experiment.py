@@ -3,20 +3,19 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from bench.benchmark.problem.experiment import (
+from bench.benchmark.problem.experiment_config import (
     TunerEntry,
     expand_sweep,
     list_experiment_names,
     load_experiment,
     parse_experiment,
 )
-from bench.benchmark.problem.recording_observations import find_recording
+from bench.benchmark.problem.experiment_recording import find_recording
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.tuner_training import compute_training_key
-from sims.core.plain_values import to_toml_value
 from sims.core.simulator import InputError
-from sims.core.toml_validation import tomllib
+from sims.core.toml_validation import to_toml_value, tomllib
 from tests.sample_experiments import SPRING, spring_experiment
 
 

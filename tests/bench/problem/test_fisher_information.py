@@ -7,7 +7,7 @@ import pytest
 
 from bench.benchmark.comparison_report import write_report
 from bench.benchmark.comparison_study import Comparison
-from bench.benchmark.problem.experiment import load_experiment, parse_experiment
+from bench.benchmark.problem.experiment_config import load_experiment, parse_experiment
 from bench.benchmark.problem.fisher_information import (
     STIFF_SIGMA_THRESHOLD,
     InformationSpectrum,

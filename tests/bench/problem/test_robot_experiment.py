@@ -7,22 +7,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.experiment import (
+from bench.benchmark.problem.experiment_config import (
+    TunerEntry,
     list_experiment_names,
     load_experiment,
     parse_experiment,
 )
-from bench.benchmark.problem.experiment_tables import TunerEntry
+from bench.benchmark.problem.missing_requirements import find_missing_model_file
 from bench.benchmark.problem.robot_experiment import (
     complete_robot_experiment,
-    find_missing_model_file,
     find_model,
     get_simulator_class,
     make_robot_experiment,
 )
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.code_digest import hash_class_source, hash_effect_sources
-from bench.benchmark.runner.run_fingerprint import RunIds, compute_fingerprint
+from bench.benchmark.runner.run_fingerprint import (
+    RunIds,
+    compute_fingerprint,
+    hash_class_source,
+    hash_effect_sources,
+)
 from bench.benchmark.runner.tuner_training import compute_training_key
 from bench.cli.commands import list_catalogue
 from bench.cli.commands.list_catalogue import format_documents

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.experiment import parse_experiment
+from bench.benchmark.problem.experiment_config import parse_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment
 from tests.sample_experiments import spring_experiment

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from bench.benchmark.problem.experiment import TunerEntry, load_experiment
+from bench.benchmark.problem.experiment_config import TunerEntry, load_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run
-from bench.benchmark.runner.run_scoring import build_rows
+from bench.benchmark.runner.run_result_rows import build_rows
 
 
 @pytest.mark.parametrize(

@@ -9,15 +9,14 @@ from importlib import import_module
 
 import pytest
 
-from bench.benchmark.problem.experiment import (
+from bench.benchmark.problem.experiment_config import (
     Experiment,
     TunerEntry,
     load_experiment,
     parse_experiment,
 )
-from bench.benchmark.runner.code_digest import hash_class_source
 from bench.benchmark.runner.experiment_runner import prepare_experiment
-from bench.benchmark.runner.run_fingerprint import compute_fingerprint
+from bench.benchmark.runner.run_fingerprint import compute_fingerprint, hash_class_source
 from bench.benchmark.runner.tuner_training import compute_training_key
 from bench.core.plugin_registries import REGISTRIES, load_plugins, tuners
 from methods.tuner import Tuner
@@ -164,11 +163,11 @@ def test_effect_of_a_plugin_file_is_part_of_what_names_it(tmp_path):
 
 @pytest.mark.slow
 def test_any_file_of_the_rooms_that_make_runs_changes_keys_and_ids(tmp_path, monkeypatch):
-    from bench.benchmark.runner import code_digest
+    from bench.benchmark.runner import run_fingerprint
 
-    for room in code_digest.COMPARISON_SOURCE_FOLDERS:
+    for room in run_fingerprint.COMPARISON_SOURCE_FOLDERS:
         shutil.copytree(
-            code_digest.PROJECT_ROOT / room,
+            run_fingerprint.PROJECT_ROOT / room,
             tmp_path / room,
             ignore=shutil.ignore_patterns("__pycache__"),
         )
@@ -176,15 +175,15 @@ def test_any_file_of_the_rooms_that_make_runs_changes_keys_and_ids(tmp_path, mon
     before = compute_training_key(experiment, REGRESSOR, 0)
 
     def names():
-        code_digest.hash_source_folders.cache_clear()
+        run_fingerprint.hash_source_folders.cache_clear()
         ids = {job.request.run for job in prepare_experiment(experiment).plan}
         return (
-            code_digest.hash_source_folders(),
+            run_fingerprint.hash_source_folders(),
             compute_training_key(experiment, REGRESSOR, 0),
             ids,
         )
 
-    monkeypatch.setattr(code_digest, "PROJECT_ROOT", tmp_path)
+    monkeypatch.setattr(run_fingerprint, "PROJECT_ROOT", tmp_path)
     try:
         whole, _, ids = names()
         files = [file for file in tmp_path.rglob("*") if file.is_file()]
@@ -198,8 +197,8 @@ def test_any_file_of_the_rooms_that_make_runs_changes_keys_and_ids(tmp_path, mon
         for file in files:
             text = file.read_bytes()
             file.write_bytes(text + b"\n")
-            code_digest.hash_source_folders.cache_clear()
-            changed.add(code_digest.hash_source_folders())
+            run_fingerprint.hash_source_folders.cache_clear()
+            changed.add(run_fingerprint.hash_source_folders())
             file.write_bytes(text)
         assert len(changed - {whole}) == len(files)
         for file in files[:: len(files) // 5]:
@@ -211,43 +210,43 @@ def test_any_file_of_the_rooms_that_make_runs_changes_keys_and_ids(tmp_path, mon
             file.write_bytes(text)
     finally:
         monkeypatch.undo()
-        code_digest.hash_source_folders.cache_clear()
+        run_fingerprint.hash_source_folders.cache_clear()
     assert compute_training_key(experiment, REGRESSOR, 0) == before
 
 
 def test_what_explains_a_drop_makes_its_shot_and_no_run_of_a_comparison(tmp_path, monkeypatch):
-    from bench.benchmark.runner import code_digest
+    from bench.benchmark.runner import run_fingerprint
 
-    for room in code_digest.BOUNCE_SHOT_SOURCE_FOLDERS:
+    for room in run_fingerprint.BOUNCE_SHOT_SOURCE_FOLDERS:
         (tmp_path / room).mkdir(parents=True)
-    monkeypatch.setattr(code_digest, "PROJECT_ROOT", tmp_path)
-    code_digest.hash_source_folders.cache_clear()
+    monkeypatch.setattr(run_fingerprint, "PROJECT_ROOT", tmp_path)
+    run_fingerprint.hash_source_folders.cache_clear()
     try:
         before = [
             compute_fingerprint(load_experiment(name), [])["code"]
             for name in ("bounce-shot", "ball-drop")
         ]
         (tmp_path / "bench" / "diagnosis" / "explain.py").write_text("changed")
-        code_digest.hash_source_folders.cache_clear()
+        run_fingerprint.hash_source_folders.cache_clear()
         after = [
             compute_fingerprint(load_experiment(name), [])["code"]
             for name in ("bounce-shot", "ball-drop")
         ]
     finally:
         monkeypatch.undo()
-        code_digest.hash_source_folders.cache_clear()
+        run_fingerprint.hash_source_folders.cache_clear()
     assert before[0] != after[0]
     assert before[1] == after[1]
 
 
 def test_a_new_file_in_a_room_counts_and_what_python_compiles_does_not(tmp_path, monkeypatch):
-    from bench.benchmark.runner import code_digest
+    from bench.benchmark.runner import run_fingerprint
 
-    monkeypatch.setattr(code_digest, "PROJECT_ROOT", tmp_path)
-    monkeypatch.setattr(code_digest, "COMPARISON_SOURCE_FOLDERS", ("room",))
+    monkeypatch.setattr(run_fingerprint, "PROJECT_ROOT", tmp_path)
+    monkeypatch.setattr(run_fingerprint, "COMPARISON_SOURCE_FOLDERS", ("room",))
     (tmp_path / "room" / "__pycache__").mkdir(parents=True)
     (tmp_path / "room" / "a.py").write_text("a")
-    rooms = code_digest.hash_source_folders.__wrapped__
+    rooms = run_fingerprint.hash_source_folders.__wrapped__
     before = rooms()
     (tmp_path / "room" / "__pycache__" / "a.pyc").write_text("c")
     assert rooms() == before
@@ -349,7 +348,7 @@ def test_every_key_of_an_experiment_matters_or_has_its_reason(module, but):
     """A new key must be listed either with a reason as irrelevant, or in CHANGES, where it changes
     the digest.
     """
-    from bench.benchmark.runner.code_digest import select_relevant_keys
+    from bench.benchmark.runner.run_fingerprint import select_relevant_keys
 
     reasons = getattr(import_module(f"bench.benchmark.runner.{module}"), but)
     names = {field.name for field in fields(Experiment)}

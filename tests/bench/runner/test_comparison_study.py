@@ -264,9 +264,9 @@ def test_first_line_says_what_and_where():
 
 def test_one_function_tells_which_study_an_experiment_or_a_folder_is(tmp_path, spring):
     from bench.benchmark.comparison_study import Comparison
-    from bench.benchmark.problem.experiment import load_experiment
+    from bench.benchmark.problem.experiment_config import load_experiment
     from bench.bounce_shot.shot_study import BounceShotStudy
-    from bench.studies.study import begin_studies, get_study_class, open_study
+    from bench.studies.study_kinds import begin_studies, get_study_class, open_study
     from tests.sample_experiments import spring_experiment
 
     assert get_study_class(load_experiment("bounce-shot")) is BounceShotStudy

@@ -7,7 +7,7 @@ from bench.benchmark.runner.experiment_runner import (
     prepare_experiment,
     run_experiment,
 )
-from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 from bench.core.plugin_registries import load_plugins
 from tests.conftest import PLUGINS
 from tests.plugins.awkward import hashed

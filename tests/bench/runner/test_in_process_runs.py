@@ -8,7 +8,7 @@ import pytest
 
 from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment
-from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.runner.worker_pools import InProcessPool, WorkerDiedError, make_pool
 from bench.benchmark.storage.result_folder import read_comparison

@@ -6,7 +6,7 @@ import pytest
 import tomli_w
 
 from bench.benchmark.isolation.process_errors import ISOLATION_NOTE
-from bench.benchmark.problem.experiment import TunerEntry
+from bench.benchmark.problem.experiment_config import TunerEntry
 from bench.benchmark.runner.tuner_author_notes import Notes
 from bench.cli.main import main
 from tests.bench.isolation.isolated_process import experiment, need, outcome

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.recording_observations import ObservedRuns
-from bench.benchmark.problem.tuning_problem import TuningProblem
-from bench.benchmark.runner.tuner_loop import ProposalEvaluator
+from bench.benchmark.problem.experiment_recording import ObservedRuns
+from bench.benchmark.problem.tuning_problem import ProposalEvaluator, TuningProblem
 from tests.sample_experiments import spring_experiment
 
 pytestmark = pytest.mark.usefixtures("spring")

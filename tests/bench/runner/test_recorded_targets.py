@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from bench.benchmark.problem.experiment import parse_experiment
+from bench.benchmark.problem.experiment_config import parse_experiment
 from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment
 from bench.core.plugin_registries import tuners
 from methods.tuner import Tuner

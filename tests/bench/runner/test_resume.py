@@ -8,8 +8,8 @@ import pytest
 
 import simgap
 from bench.benchmark.comparison_study import Comparison
-from bench.benchmark.problem.experiment import parse_experiment
-from bench.benchmark.problem.recording_observations import ObservedRuns
+from bench.benchmark.problem.experiment_config import parse_experiment
+from bench.benchmark.problem.experiment_recording import ObservedRuns
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.study_base import prepare_study

@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from bench.benchmark.isolation.resource_limits import limited_memory
-from bench.benchmark.runner.plugin_discovery import Plugin
+from bench.benchmark.runner.plugin_inspection import Plugin
 from bench.benchmark.runner.worker_pools import (
     MAX_RETRIES,
     LocalPool,

@@ -216,8 +216,8 @@ def test_tuner_seconds_are_those_up_to_the_threshold():
 def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
     import time
 
-    from bench.benchmark.comparison_report import REQUIRED_RUN_COLUMNS
     from bench.benchmark.comparison_study import Comparison
+    from bench.benchmark.statistics.comparison_statistics import REQUIRED_RUN_COLUMNS
     from bench.benchmark.statistics.error_curves import build_error_table
     from bench.benchmark.storage.result_folder import read_comparison
     from bench.core.plugin_registries import load_plugins

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from bench.api.compare import ComparisonResult
+from bench.api.comparison_result import ComparisonResult
 from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.runner.experiment_runner import run_experiment
 from bench.benchmark.runner.study_base import prepare_study

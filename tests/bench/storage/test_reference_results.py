@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.api.compare import ComparisonResult
+from bench.api.comparison_result import ComparisonResult
 from bench.benchmark.storage.result_folder import read_checked_comparison
 
 REFERENCE = Path(__file__).parents[3] / "results" / "reference"

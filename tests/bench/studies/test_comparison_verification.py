@@ -11,7 +11,7 @@ import tomli_w
 
 from bench.benchmark.runner.study_base import prepare_study
 from bench.benchmark.storage.result_folder import read_configuration
-from bench.figures.style import TRUSTED_TUNERS_NOTE
+from bench.figures.figure_layout import TRUSTED_TUNERS_NOTE
 from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
@@ -113,7 +113,7 @@ def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes
     finished_folder, tmp_path, monkeypatch
 ):
     from bench.benchmark.comparison_study import Comparison
-    from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+    from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 
     held = read_configuration(finished_folder)
     experiment = held.experiment.chosen(salt="", salt_sha256="")
@@ -137,7 +137,7 @@ def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes
 
 def test_a_folder_whose_salt_is_gone_is_not_resumed(finished_folder, tmp_path):
     from bench.benchmark.comparison_study import Comparison
-    from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+    from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 
     held = read_configuration(finished_folder)
     load_plugins_for_experiment(held.plugins, held.experiment)

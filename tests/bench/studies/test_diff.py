@@ -10,7 +10,7 @@ import tomli_w
 
 from bench.benchmark.storage.result_folder import read_configuration
 from bench.schemas import find_violations
-from bench.studies import diff_comparisons
+from bench.studies import result_diff
 from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.sample_experiments import SPRING
@@ -127,7 +127,7 @@ def test_only_seeds_that_both_have_are_compared(run, tmp_path):
     statuses = pd.read_csv(other / "status.csv", keep_default_na=False)
     kept = ~((statuses["tuner"] == "random") & (statuses["seed"] == 1))
     statuses[kept].to_csv(other / "status.csv", index=False)
-    found = diff_comparisons.diff_comparisons(run, other)
+    found = result_diff.diff_comparisons(run, other)
     assert set(found.errors["ratio"]) == {1.0}
     assert not found.has_changed, "fewer runs are no failures"
 

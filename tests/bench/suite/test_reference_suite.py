@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.problem.experiment import load_experiment
-from bench.suite.suite_page import LOSS_FACTOR, build_headline, describe_losses
+from bench.benchmark.problem.experiment_config import load_experiment
+from bench.suite.suite_report import LOSS_FACTOR, build_headline, describe_losses
 from bench.suite.suite_runs import RUN_KEYS, read_suite_runs
 from bench.suite.suite_statistics import FREE, SuiteTables, build_guide
 

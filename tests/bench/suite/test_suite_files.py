@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.experiment import expand_sweep, load_experiment
-from bench.benchmark.problem.experiment_tables import compute_problem_hash
+from bench.benchmark.problem.experiment_config import (
+    compute_problem_hash,
+    expand_sweep,
+    load_experiment,
+)
 from bench.benchmark.problem.missing_requirements import leave_out_missing_problems
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import tuners
 from bench.studies.archive_bundle import verify_results, write_bundle
-from bench.studies.study import begin_studies, report_jointly
+from bench.studies.study_kinds import begin_studies, report_jointly
 from bench.suite import suite_runs
 from bench.suite.suite_runs import read_suite_runs, write_suite_runs
 from sims.core.simulator import InputError
@@ -182,7 +185,7 @@ def test_a_method_of_ones_own_is_ranked_among_the_stored_ones(tmp_path, small_su
 
     plugin = tmp_path / "mine.py"
     plugin.write_text(MINE)
-    from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+    from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 
     own = small_suite.with_tuners(["mine"]).chosen(trusted=True)
     load_plugins_for_experiment([str(plugin)], own)

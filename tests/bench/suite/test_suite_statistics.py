@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.suite.suite_page import (
+from bench.suite.suite_report import (
     build_headline,
     describe_losses,
     describe_tests,

@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from tests.benchmarks import real_recordings
 from tests.docs.page_numbers.page_values import (

@@ -10,7 +10,7 @@ from math import hypot
 import pandas as pd
 from scipy.stats import friedmanchisquare, spearmanr
 
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
 from sims.core.toml_validation import read_toml
 from tests.benchmarks.vision_error_bound import BOUND

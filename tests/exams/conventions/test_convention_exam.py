@@ -22,9 +22,9 @@ from bench.diagnosis.conventions.corrected_description import (
 from bench.diagnosis.conventions.signal_changes import SignalChange
 from bench.diagnosis.conventions.unit_check import Subject
 from bench.logs.recording_loading import load_recording
+from sims.core.angles_and_quaternions import unwrapped
 from sims.core.toml_validation import read_toml
 from sims.recording.recording_description import read_meta
-from sims.recording.unit_conversion import unwrapped
 from tests.exams.conventions.convention_logs import BROKEN, CAUSES, write_log
 from tests.malformed_input import valid_input
 

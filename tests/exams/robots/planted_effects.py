@@ -14,7 +14,9 @@ from bench.diagnosis_benchmark.case_generation.effect_coefficients import (
     SHAPE_SAMPLERS,
     draw_direction,
 )
-from bench.diagnosis_benchmark.machine_cases.hidden_causes import MOTION_SCALED_EFFECTS
+from bench.diagnosis_benchmark.machine_cases.machine_effect_coefficients import (
+    MOTION_SCALED_EFFECTS,
+)
 
 JOINT = (
     "friction.coulomb", "friction.stribeck", "drag.linear", "drag.quadratic", "spring.linear",

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+from bench.diagnosis_benchmark.case_generation.benchmark_case import (
     MIN_DISTINCT_SIZE,
     MIN_SIMPLER_RESIDUAL,
 )

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation.reference_signals import (
+from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import (
     SENSOR_EFFECTS,
     apply_input_effects,
 )

@@ -9,18 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.diagnosis_benchmark.case_generation import refitted_residuals
+from bench.diagnosis_benchmark.case_generation import reference_simulation, refitted_residuals
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
 from bench.diagnosis_benchmark.case_generation.case_sampling import (
     SUBTHRESHOLD_SIZES,
     SYSTEMS,
     draw_case,
     restore_conditions,
 )
-from bench.diagnosis_benchmark.case_generation.recording_conditions import BenchmarkCase
-from bench.diagnosis_benchmark.case_generation.reference_simulation import (
-    SIMULATORS,
-    UNMODELLED_CAUSES,
-)
+from bench.diagnosis_benchmark.case_generation.recording_conditions import SIMULATORS
+from bench.diagnosis_benchmark.case_generation.reference_simulation import UNMODELLED_CAUSES
 from bench.diagnosis_benchmark.case_set import find_equivalent_effects, write_case
 from bench.diagnosis_benchmark.grading import MAX_SET_SIZE, grade_answer
 from sims import effects as library
@@ -118,7 +116,7 @@ class SystemCase(Case):
             return {}
         names = [name for names in sets for name in names if name not in item.effects]
         setting = restore_conditions(item)
-        observed = refitted_residuals.simulate_observations(setting, item.effects)
+        observed = reference_simulation.simulate_observations(setting, item.effects)
         phi = setting.noise.phi if item.noise == "ar1" else 0.0
         samples = observed.size * (1 - phi) / (1 + phi)  # Effective number with AR(1) noise.
         return {

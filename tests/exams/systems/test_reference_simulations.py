@@ -6,12 +6,14 @@ SciPy and MuJoCo agree about every effect, and unmodelled causes agree with clos
 import numpy as np
 import pytest
 
-from bench.diagnosis_benchmark.case_generation.recording_conditions import draw_input_signal
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    SIMULATORS,
+    draw_input_signal,
+    get_constants,
+)
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     CHANNELS,
-    SIMULATORS,
     TrueSystem,
-    get_constants,
     simulate_with_mujoco,
     simulate_with_scipy,
 )

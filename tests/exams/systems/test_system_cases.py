@@ -7,25 +7,31 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from bench.diagnosis_benchmark.case_generation import effect_coefficients, refitted_residuals
-from bench.diagnosis_benchmark.case_generation.case_sampling import (
-    EQUIVALENT_EFFECTS,
-    count_held_out_runs,
-    draw_case,
-    find_coefficients,
-    restore_conditions,
+from bench.diagnosis_benchmark.case_generation import (
+    effect_coefficients,
+    reference_simulation,
+    refitted_residuals,
 )
-from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+from bench.diagnosis_benchmark.case_generation.benchmark_case import (
     MIN_DISTINCT_SIZE,
     BenchmarkCase,
+)
+from bench.diagnosis_benchmark.case_generation.case_sampling import (
+    EQUIVALENT_EFFECTS,
+    draw_case,
+    restore_conditions,
+)
+from bench.diagnosis_benchmark.case_generation.effect_coefficients import find_coefficients
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    SIMULATORS,
     RequestedConditions,
     SensorNoise,
     draw_conditions,
+    get_constants,
 )
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
-    SIMULATORS,
     TrueSystem,
-    get_constants,
+    count_held_out_runs,
     simulate_with_mujoco,
     simulate_with_scipy,
 )
@@ -117,7 +123,7 @@ def test_cases_that_the_sensors_cannot_show_are_refused():
 
 def test_neither_of_two_effects_explains_both():
     item = draw_case("double", "ball", 1)
-    observed = refitted_residuals.simulate_observations(restore_conditions(item), item.effects)
+    observed = reference_simulation.simulate_observations(restore_conditions(item), item.effects)
     left = [
         refitted_residuals.compute_refitted_residual(restore_conditions(item), observed, name, c)
         for name, c in item.effects.items()
@@ -157,7 +163,7 @@ def test_equivalent_effects_explain_each_other(system, driven, names):
     )
     drawn = next(conditions for conditions in drawings if conditions.is_driven is driven)
     first = min(names)
-    observed = refitted_residuals.simulate_observations(
+    observed = reference_simulation.simulate_observations(
         drawn, {first: find_coefficients(first, drawn, 3.0, np.random.default_rng(0))}
     )
     for other in names - {first}:

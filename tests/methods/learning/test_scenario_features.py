@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.experiment_config import load_experiment
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
-from methods.learning.scenario_features import ScenarioFeatures, compute_response_coefficients
+from methods.learning.input_features import ScenarioFeatures, compute_response_coefficients
 from methods.tuner import EMPTY_SCENE, ScenarioInfo
 from methods.tuners.direct_regressor import DirectRegressor
 from methods.tuners.tunenet import TuneNet

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sims.core.rotations import compute_yaw_pitch_roll
+from sims.core.angles_and_quaternions import compute_yaw_pitch_roll
 from sims.core.simulator import InputError
 from sims.recording.recorded_poses import convert_quaternions, find_recorded_bases
 

@@ -7,12 +7,8 @@ import pytest
 
 from sims.core.simulator import Channel, Constant, InputError, Simulator
 from sims.recording.csv_table import read_csv_fast
-from sims.recording.recording import (
-    Run,
-    make_frame_recording,
-    read_recording,
-    read_system_name,
-)
+from sims.recording.recording import Run, read_recording, read_system_name
+from sims.recording.recording_frame import make_frame_recording
 from sims.recording.recording_writer import write_recording
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum

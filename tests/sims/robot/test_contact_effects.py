@@ -4,10 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.logs.quality.pose_check import find_recorded_contacts
 from sims.core.simulator import InputError, Scenario
 from sims.recording.recording import Recording, Run
-from sims.robot.contact_pairs import add_contact_pairs
+from sims.robot.contact_pairs import add_contact_pairs, find_recorded_contacts
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator
 from tests.sims.robot.sample_arms import write_and_check

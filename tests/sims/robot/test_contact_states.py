@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sims.core.simulator import Scenario
-from sims.robot.dynamics.contact_states import ContactModel, settle_contacts
+from sims.robot.dynamics.contact_equilibrium import ContactModel, settle_contacts
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator

@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.benchmark.runner.code_digest import hash_class_source
+from bench.benchmark.runner.run_fingerprint import hash_class_source
 from bench.conformance import SIMULATOR_CHECKS
 from bench.core.plugin_registries import load_plugins, make_robot_simulator, simulators
-from bench.diagnosis.extended_robot_files import collect_causes
 from bench.diagnosis.score_extended import score_model
 from sims.core.simulator import InputError, Scenario
 from sims.extended_simulator import (
@@ -24,6 +23,7 @@ from sims.extended_simulator import (
     read_extended,
     write_extended,
 )
+from sims.robot.fitted_causes import collect_causes
 from sims.robot.integrator_settings import IntegratorSettings
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator as robot_simulator

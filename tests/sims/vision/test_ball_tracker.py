@@ -13,6 +13,7 @@ from dataclasses import replace
 from sims.core import medians
 from sims.core.simulator import InputError
 from sims.vision import ball_tracker as tracking
+from sims.vision import video_files
 from sims.vision.ball_renderer import BallScene, SceneAppearance
 from sims.vision.ball_tracker import track_ball
 from sims.vision.pinhole_camera import PinholeCamera
@@ -133,7 +134,7 @@ def test_a_short_film_is_decoded_once_and_a_long_one_each_time_with_the_same_tra
 
     short, long = Source(), Source()
     kept = tracking.track_ball(short)
-    monkeypatch.setattr(tracking, "_MAX_CACHED_BYTES", 10_000)
+    monkeypatch.setattr(video_files, "_MAX_CACHED_BYTES", 10_000)
     again = tracking.track_ball(long)
     assert (short.passes, long.passes) == (1, 3)
     np.testing.assert_array_equal(kept.u, again.u)

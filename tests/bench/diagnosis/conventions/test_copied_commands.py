@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.diagnosis.conventions.convention_hypotheses import find_copied_commands
+from bench.logs.quality.servo_checks import find_copied_commands
 from bench.logs.recording_loading import load_recording
 from tests.bench.diagnosis.simulated_logs import follow, write_log
 from tests.command_output import run_command

@@ -13,7 +13,7 @@ import tomllib
 from bench.api.datasheet import datasheet
 from bench.diagnosis.datasheet.datasheet import DataSheet
 from bench.diagnosis.datasheet.datasheet_content import SheetRow
-from bench.diagnosis.datasheet.mjcf_class import build_mjcf
+from bench.diagnosis.datasheet.datasheet_mjcf import build_mjcf
 from bench.diagnosis.explanation import Explanation
 from sims import extended_simulator
 from sims.core.simulator import InputError

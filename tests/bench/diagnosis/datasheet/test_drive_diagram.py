@@ -9,7 +9,7 @@ import pytest
 
 from bench.core.plugin_registries import effects, simulators
 from bench.diagnosis.datasheet.datasheet import DataSheet
-from bench.diagnosis.datasheet.datasheet_subject import make_subject
+from bench.diagnosis.datasheet.datasheet_joint import make_subject
 from bench.diagnosis.datasheet.drive_diagram import DriveDiagram, compute_drive_diagram
 from sims.extended_simulator import ExtendedSimulator, FittedValue
 from tests.bench.diagnosis.datasheet.drive_recordings import FRICTION

@@ -12,8 +12,8 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.datasheet.datasheet import DataSheet
-from bench.diagnosis.datasheet.datasheet_subject import make_subject
-from bench.diagnosis.datasheet.mjcf_class import build_mjcf, make_class_name
+from bench.diagnosis.datasheet.datasheet_joint import make_subject
+from bench.diagnosis.datasheet.datasheet_mjcf import build_mjcf, make_class_name
 from bench.diagnosis.score_extended import score_model
 from sims.extended_simulator import FittedValue
 from tests.bench.diagnosis.datasheet.drive_recordings import CONSTANTS, FRICTION, TRUE_PARAMETERS

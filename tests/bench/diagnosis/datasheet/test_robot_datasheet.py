@@ -14,7 +14,7 @@ from bench.diagnosis.datasheet.datasheet_content import (
     format_name,
     format_short_name,
 )
-from bench.diagnosis.datasheet.datasheet_subject import make_subject
+from bench.diagnosis.datasheet.datasheet_joint import make_subject
 from bench.logs.recording_joining import load_joined
 from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue

@@ -13,8 +13,8 @@ from bench.api.datasheet import datasheet
 from bench.core.plugin_registries import simulators
 from bench.diagnosis.datasheet import datasheet_figure
 from bench.diagnosis.datasheet.datasheet import DataSheet
-from bench.diagnosis.datasheet.datasheet_subject import make_subject
-from bench.figures.style import apply_settings
+from bench.diagnosis.datasheet.datasheet_joint import make_subject
+from bench.figures.figure_layout import apply_settings
 from tests.bench.diagnosis.explained_samples import recording
 from tests.bench.figures.figure_readability import unreadable
 from tests.command_output import run_command

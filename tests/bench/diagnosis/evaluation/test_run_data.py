@@ -3,7 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.run_data import estimate_initial_value_and_slope, take_first_samples
+from bench.diagnosis.evaluation.initial_state_guesses import (
+    estimate_initial_value_and_slope,
+    take_first_samples,
+)
 from sims.core.simulator import Scenario
 from sims.systems.ball import Ball
 from tests.bench.diagnosis.explained_samples import changed, evaluator, recorded, recording

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
+from bench.diagnosis.evaluation.autoregressive_surrogates import draw_surrogates
 from tests.bench.diagnosis.explained_samples import autocorrelation, correlated, everything, holes
 
 

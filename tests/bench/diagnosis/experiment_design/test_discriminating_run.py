@@ -8,7 +8,7 @@ from bench.diagnosis.experiment_design.discriminating_run import (
     propose_discriminating_run,
 )
 from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.effect_search import EffectSearch
 from sims.core.simulator import Scenario

@@ -11,8 +11,8 @@ from bench.diagnosis.experiment_design.next_run import (
     _iterate_connected_groups,
     _may_longer_run_help,
 )
-from bench.logs.quality.pose_check import find_contacts
 from sims.core.simulator import InputError
+from sims.robot.contact_pairs import find_contacts
 from tests.bench.diagnosis.simulated_logs import write_log
 from tests.command_output import run_command
 

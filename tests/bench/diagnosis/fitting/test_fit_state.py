@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.discretisation_error import MAX_CORRECTED_ERROR, StepRefinement
-from bench.diagnosis.fitting.levenberg_marquardt_state import (
+from bench.diagnosis.fitting.levenberg_marquardt import (
     INITIAL_DAMPING,
     INITIAL_DAMPING_GROWTH,
     FitPoint,

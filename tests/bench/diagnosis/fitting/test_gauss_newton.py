@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bench.diagnosis.fitting.levenberg_marquardt_step import compute_gauss_newton_step
+from bench.diagnosis.fitting.levenberg_marquardt import compute_gauss_newton_step
 
 FREE = np.zeros((4, 2))
 NONE = np.zeros(3, dtype=bool)

@@ -7,9 +7,9 @@ import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.multiple_shooting import forgets_initial_state
+from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import Scenario

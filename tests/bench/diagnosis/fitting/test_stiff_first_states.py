@@ -10,7 +10,7 @@ import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.logs.recording_loading import load_recording
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log

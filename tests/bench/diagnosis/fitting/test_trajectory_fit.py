@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import (
     OBSERVED_STATE_PRIOR_SIGMA,
     UNOBSERVED_STATE_PRIOR_SIGMA,

@@ -11,7 +11,7 @@ from bench.diagnosis.kalman.candidate_responses import (
     compute_parameter_responses,
     compute_responses,
 )
-from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, add_noise_states, filter_runs
+from bench.diagnosis.kalman.kalman_recursions import LinearRuns, add_noise_states, filter_runs
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns, linearise_run
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.kalman.filter_and_smoother import (
+from bench.diagnosis.kalman.kalman_recursions import (
     LinearRuns,
     add_noise_states,
     filter_runs,

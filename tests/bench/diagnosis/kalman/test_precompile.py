@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, smooth_runs
+from bench.diagnosis.kalman.kalman_recursions import LinearRuns, filter_runs, smooth_runs
 from sims.engines.compiled import compiled_functions
 
 

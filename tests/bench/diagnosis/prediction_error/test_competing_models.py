@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.explain import explain
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.prediction_error import competing_models, single_effect_fits
 from bench.diagnosis.prediction_error.effects_at_joints import list_joint_model_effects
 from sims.effects.drag import LinearDrag

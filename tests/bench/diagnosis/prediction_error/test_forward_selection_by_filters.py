@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.diagnosis.prediction_error import forward_selection_by_filters as forward_selection
+from bench.diagnosis.prediction_error import stepwise_selection_by_filters as forward_selection
 from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
 
 

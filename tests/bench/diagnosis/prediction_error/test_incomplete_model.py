@@ -12,7 +12,7 @@ from bench.core.plugin_registries import simulators
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
-from bench.diagnosis.prediction_error.identification_without_simulation import is_long
+from bench.diagnosis.prediction_error.stepwise_selection_by_filters import is_long
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
 from bench.logs.recording_loading import load_recording
 from bench.logs.segmentation import segment_recording

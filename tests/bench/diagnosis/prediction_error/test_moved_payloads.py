@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.prediction_error.moved_payloads import list_moved_payloads
+from bench.diagnosis.prediction_error.physically_equivalent_effects import list_moved_payloads
 from bench.logs.recording_loading import load_recording
 from tests.bench.diagnosis.arm_model import ARM
 from tests.bench.diagnosis.simulated_logs import describe, write_log

@@ -12,7 +12,7 @@ from bench.diagnosis.pipeline.base_model import filter_and_fit
 from bench.diagnosis.pipeline.recording_preparation import prepare_runs
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.output_error_scores import OutputErrorScores
+from bench.diagnosis.prediction_error.effect_scores_on_ground import OutputErrorScores
 from tests.bench.diagnosis.simulated_logs import follow, write_log
 from tests.exams.planted.model_files import ROVER
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from bench.diagnosis.prediction_error.regression_products import ResponseProducts
 from bench.diagnosis.prediction_error.regression_selection import Regression
-from bench.diagnosis.prediction_error.response_products import ResponseProducts
 from bench.diagnosis.search.score_test import DirectionGroup
 
 RUNS, SAMPLES, COLUMNS = 4, 80, 6

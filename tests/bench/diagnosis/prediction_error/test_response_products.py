@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.diagnosis.prediction_error.response_products import (
+from bench.diagnosis.prediction_error.regression_products import (
     SAMPLES_PER_BLOCK,
     GramMatrices,
     ResponseProducts,

@@ -5,16 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
-from bench.diagnosis.prediction_error import single_effect_fits
-from bench.diagnosis.prediction_error.regression_columns import list_probes
-from bench.diagnosis.prediction_error.simulated_fits import RatedStart, compute_likely_cost
-from bench.diagnosis.prediction_error.single_effect_fits import (
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
+from bench.diagnosis.prediction_error import elasticity_and_backlash_fits, single_effect_fits
+from bench.diagnosis.prediction_error.elasticity_and_backlash_fits import (
     SMALLER_SERIES_SHARES,
     add_series_effect,
     fit_series_effects,
     simulate_series_effects,
 )
+from bench.diagnosis.prediction_error.simulated_fits import RatedStart, compute_likely_cost
+from bench.diagnosis.search.candidate_directions import list_probes
 
 BASE_COST = 1000.0
 
@@ -129,7 +129,7 @@ def test_a_transmission_is_added_at_the_joint_where_the_best_model_lacks_a_force
         assert limit == BASE_COST
         return SimpleNamespace(effects=("added",))
 
-    monkeypatch.setattr(single_effect_fits, "fit_series_effects", fit_added)
+    monkeypatch.setattr(elasticity_and_backlash_fits, "fit_series_effects", fit_added)
     context = SimpleNamespace(
         evaluator=example_arm,
         filters=SimpleNamespace(get_filter=lambda _: SimpleNamespace(joints_by_loss=[1, 0])),

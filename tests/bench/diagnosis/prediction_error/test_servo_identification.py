@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.explain import explain
+from bench.diagnosis.fitting.levenberg_marquardt import solve_damped
 from bench.diagnosis.prediction_error.servo_identification import (
     ServoModel,
     _estimate_gain,
     _ServoFitter,
-    _solve_damped,
     _Trial,
     has_unknown_servos,
 )
@@ -146,9 +146,9 @@ def test_each_joint_starts_from_the_parameters_that_simulate_it_better(monkeypat
 
 def test_a_step_without_damping_solves_the_least_squares_problem():
     block = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
-    np.testing.assert_allclose(_solve_damped(block, block @ [2.0, -3.0], 0.0), [2.0, -3.0])
+    np.testing.assert_allclose(solve_damped(block, block @ [2.0, -3.0], 0.0), [2.0, -3.0])
     # The damping adds its share of the diagonal: (3 + 3) x = 6 for one unknown.
-    np.testing.assert_allclose(_solve_damped(block[:, :1], np.full(3, 2.0), 1.0), [1.0])
+    np.testing.assert_allclose(solve_damped(block[:, :1], np.full(3, 2.0), 1.0), [1.0])
 
 
 @pytest.mark.parametrize(

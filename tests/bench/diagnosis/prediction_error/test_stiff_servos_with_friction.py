@@ -10,7 +10,7 @@ from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.kalman import linearised_filter
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-from bench.diagnosis.prediction_error.effects_at_joints import (
+from bench.diagnosis.prediction_error.physically_equivalent_effects import (
     list_similar_dampings,
     list_similar_inertias,
 )

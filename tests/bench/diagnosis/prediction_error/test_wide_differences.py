@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.diagnosis.fitting.levenberg_marquardt_state import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
 from bench.diagnosis.prediction_error.settled_simulations import (
     MAX_RESPONSE,
     MIN_RESPONSE,

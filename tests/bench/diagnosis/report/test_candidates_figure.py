@@ -7,7 +7,7 @@ import pytest
 
 from bench.api.explain import explain
 from bench.diagnosis.report.candidates_figure import draw_candidates_figure
-from bench.diagnosis.report.effect_and_unit_text import format_p_value
+from bench.diagnosis.report.cause_and_value_text import format_p_value
 from bench.diagnosis.report.explanation_figures import draw_figure
 from tests.bench.diagnosis.explained_samples import recording
 from tests.bench.diagnosis.robot_report_data import candidates, make_robot_report

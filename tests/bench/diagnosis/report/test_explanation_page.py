@@ -12,7 +12,8 @@ import pytest
 
 from bench.diagnosis.identifiability import ParameterIdentifiability
 from bench.diagnosis.pipeline.report_data_builder import _read_track_figure
-from bench.diagnosis.report.explanation_page import compute_channel_errors, render_report
+from bench.diagnosis.report.explanation_page import render_report
+from bench.diagnosis.report.residual_analysis import compute_channel_errors
 from bench.figures.figure_output import FigureFiles
 from bench.pages.page_table import INITIAL_ROWS
 from tests.bench.diagnosis.report.test_summary_text import VERDICTS

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from bench.diagnosis.extended_robot_files import find_model_file_changes
+from bench.diagnosis.report.model_file_changes import find_model_file_changes
 from sims.extended_simulator import FittedValue
 from sims.robot.export.write_model_file import write_model_files
 from sims.robot.export.xml_editing import strip_heading

@@ -9,18 +9,16 @@ from bench.diagnosis.report.candidate_ranking import (
     rank_candidates,
     select_shown_candidates,
 )
-from bench.diagnosis.report.cause_text import (
+from bench.diagnosis.report.cause_and_value_text import (
+    format_effect,
+    format_effect_name,
     format_effect_set,
     format_missing_causes,
+    is_parameter_error,
     shorten_effect_name,
     strip_place,
 )
 from bench.diagnosis.report.diagnosed_places import list_place_marks
-from bench.diagnosis.report.effect_and_unit_text import (
-    format_effect,
-    format_effect_name,
-    is_parameter_error,
-)
 from bench.diagnosis.report.report_data import ChannelInfo
 from bench.diagnosis.report.summary_text import (
     format_detectable_gap,

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.report.candidate_ranking import rank_candidates
+from bench.diagnosis.report.candidate_ranking import build_candidate_table, rank_candidates
 from bench.diagnosis.report.explanation_figures import (
     draw_figure,
     get_extreme_pose,
     list_figure_names,
 )
-from bench.diagnosis.report.explanation_page import build_candidate_table, render_report
+from bench.diagnosis.report.explanation_page import render_report
 from bench.diagnosis.report.joint_figure import list_joint_rows
 from bench.diagnosis.report.run_selection import select_worst_run
 from bench.figures import robot_figure as drawing

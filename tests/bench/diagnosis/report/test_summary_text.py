@@ -4,8 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.report.detectable_gap import compute_detectable_gap
-from bench.diagnosis.report.effect_and_unit_text import (
+from bench.diagnosis.report.cause_and_value_text import (
     format_effect,
     format_effect_name,
     format_estimate,
@@ -16,6 +15,7 @@ from bench.diagnosis.report.effect_and_unit_text import (
     format_unit,
     joined,
 )
+from bench.diagnosis.report.detectable_gap import compute_detectable_gap
 from bench.diagnosis.report.report_data import ChannelInfo, DataSplit
 from bench.diagnosis.report.summary_text import (
     format_gain,

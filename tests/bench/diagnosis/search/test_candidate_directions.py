@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.candidate_directions import (
     END_STOP_DEPTH_SHARES,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from bench.diagnosis.evaluation.candidate_direction import CandidateDirection
+from bench.diagnosis.evaluation.autoregressive_surrogates import draw_surrogates
 from bench.diagnosis.evaluation.noise_model import PHI_GRID, NoiseModel
-from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
+from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.score_test import (
     ScoreTest,

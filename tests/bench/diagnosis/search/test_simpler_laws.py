@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from sims.systems.slider import Slider
 from tests.bench.diagnosis.explained_samples import recorded, searched
 

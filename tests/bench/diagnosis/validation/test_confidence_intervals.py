@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel, maximise_likelihood
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
+from bench.diagnosis.fitting.trajectory_derivatives import compute_central_jacobian
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.validation.confidence_intervals import (
-    compute_central_jacobian,
-    compute_covariance,
-    compute_intervals,
-)
+from bench.diagnosis.validation.confidence_intervals import compute_covariance, compute_intervals
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
 from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider

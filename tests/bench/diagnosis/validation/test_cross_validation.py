@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import simgap
-from bench.benchmark.problem.recording_observations import load_recorded_runs
+from bench.benchmark.problem.experiment_recording import load_recorded_runs
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.report.summary_text import format_summary
 from bench.diagnosis.validation.cross_validation import CrossValidation

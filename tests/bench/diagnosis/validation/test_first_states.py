@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
-from bench.diagnosis.fitting.levenberg_marquardt_state import FitStart
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.validation.held_out_runs import find_first_states
+from bench.diagnosis.search.fit_starts import find_first_states
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.diagnosis.validation.gap_closed import compute_held_out_gain
+from bench.diagnosis.pipeline.held_out_gap_closed import compute_held_out_gain
 
 
 def errors(rmse, runs=6, samples=200, seed=0):

@@ -1,0 +1,108 @@
+"""Check the recorded poses of a robot: contacts, overlaps, and initial poses of floating bodies.
+
+Initial poses are not estimated, and the same commands produce a different motion from a different
+initial pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from bench.logs.quality.quality_finding import Anomaly, QualityFinding
+from sims.core.simulator import Simulator
+from sims.recording.recording import Recording
+from sims.recording.recording_description import get_required_state_units
+
+MIN_OVERLAP_METRES = 1e-3
+"""Smallest depth, in m, at which two bodies overlap; feet on the ground sink in by less."""
+MIN_OVERLAP_SHARE = 0.9
+"""Smallest share of the recorded poses in which bodies overlap that do so by their shape."""
+
+
+def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    """Find bodies of a robot that overlap in most of the recorded poses.
+
+    Contact forces would then act all the time, which is not possible in a real robot: the shapes
+    in the model file are too large. A pair counts at most once in a pose, with its deepest contact,
+    and only if that is deeper than `MIN_OVERLAP_METRES`. Held-out runs are not used.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+    """
+    if not kind.has_model:
+        return
+    # This import is needed for robots only.
+    from sims.robot.contact_pairs import can_touch, iterate_poses
+
+    robot: Any = kind.robot  # type: ignore[attr-defined]
+    model = robot.compiled
+    if not can_touch(model):
+        return
+    # Depth of the overlap in m in each pose with one, by the names of two bodies.
+    depths: dict[tuple[str, str], list[float]] = {}
+    pose_count = 0
+    for run in recording.training():
+        for data in iterate_poses(kind, run.channels):
+            pose_count += 1
+            deepest: dict[tuple[str, str], float] = {}
+            for contact in data.contact[: data.ncon]:
+                bodies = [model.body(int(model.geom_bodyid[g])).name for g in contact.geom]
+                pair = min(bodies), max(bodies)
+                deepest[pair] = max(deepest.get(pair, 0.0), -float(contact.dist))
+            for pair, depth in deepest.items():
+                if depth > MIN_OVERLAP_METRES:
+                    depths.setdefault(pair, []).append(depth)
+    for (body, other_body), values in depths.items():
+        if len(values) > MIN_OVERLAP_SHARE * pose_count:
+            if robot.format == "urdf":
+                remedy = "make their collision shapes smaller"
+            else:
+                remedy = f'add <contact><exclude body1="{body}" body2="{other_body}"/></contact>'
+            yield QualityFinding(
+                "overlap",
+                f"bodies {body} and {other_body} overlap by up to {1e3 * max(values):.3g} mm in "
+                f"{len(values) / pose_count:.0%} of the recorded poses, so that a contact force "
+                "always acts between them",
+                f"{remedy} in {robot.path.name}",
+            )
+
+
+def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
+    """Find floating joints whose initial state is missing in some run.
+
+    No sensor of a usual log shows where a free body begins, and the fit does not estimate it, so
+    the description must state it, at least in part, unless closed loops determine it. Only the
+    first run without any state of the joint is reported.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        One certain anomaly for each such joint.
+    """
+    states_by_joint: dict[str, list[str]] = {}
+    for name in get_required_state_units(kind):
+        # The name of a state is that of its quantity, joint and coordinate: q.hull.x.
+        joint = name.split(".", 1)[1].rpartition(".")[0]
+        states_by_joint.setdefault(joint, []).append(name)
+    names = [run.name for run in recording.runs]
+    for joint, states in states_by_joint.items():
+        runs_without_state = (
+            run for run in recording.runs if run.initial.keys().isdisjoint(states)
+        )
+        run = next(runs_without_state, None)
+        if run is None:
+            continue
+        if names.count(run.name) > 1:  # two parts of a single run
+            missing_text = (
+                f"where {joint} is when the last third of a single run begins; record another"
+            )
+        else:
+            missing_text = (
+                f"where {joint} begins; state [runs.{run.name}.initial], of {', '.join(states)} "
+                "(states that are left out are as in the model file, at rest)"
+            )
+        yield Anomaly(f"run {run.name}: the log does not state {missing_text}", True)
