@@ -6,8 +6,9 @@ from bench.api.compare import compare, sweep
 from bench.api.comparison_result import ComparisonResult
 from bench.api.datasheet import datasheet
 from bench.api.design import NextRecording, design
-from bench.api.explain import explain, score
+from bench.api.explain import explain
 from bench.api.recordings import read_recording, simulate
+from bench.api.score import score
 from bench.benchmark.problem.experiment_config import Experiment
 from bench.conformance import parametrize
 from bench.core.diagnoser import Answer, Diagnoser, DiagnoserTrainingTask, DiagnosisCase, NamedCause

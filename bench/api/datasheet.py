@@ -16,7 +16,7 @@ from bench.diagnosis.datasheet.datasheet import DataSheet, build_datasheet
 from bench.diagnosis.datasheet.datasheet_joint import make_subject
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
-from bench.diagnosis.verdict import Verdict
+from bench.diagnosis.verdict import Verdict, read_verdict
 from bench.logs.recording_joining import load_joined
 from sims.core.argument_checks import Expected, Name
 from sims.core.simulator import InputError
@@ -102,9 +102,6 @@ def check_joint_exists(
 
 def _read_explanation_folder(folder: Path) -> tuple[ExtendedSimulator, Verdict]:
     """Read the results that explain has written to a folder."""
-    # Imported here, because it imports pandas, which most data sheets do not need.
-    from bench.diagnosis.verdict import read_verdict
-
     verdict = read_verdict(folder)
     extended, kind, _ = open_extended(folder / "extended.toml", simulators.get)
     return replace(extended, kind=kind), verdict

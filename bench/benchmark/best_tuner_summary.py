@@ -25,6 +25,8 @@ from bench.pages.text_format import format_number
 
 _DIGITS = 2
 """Number of significant digits of factors."""
+
+
 RANGE_PHRASES = {
     "in": "targets in the training range",
     "wide": "targets anywhere in the bounds",
@@ -234,11 +236,6 @@ def _format_worse_tuner(row: dict[Any, Any]) -> str:
     return f"{row['tuner']}{factor} ({row['targets_worse']}/{row['targets']})"
 
 
-def format_error_floor(statistics: ComparisonStatistics) -> str:
-    """State which errors count as equal."""
-    return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"
-
-
 def explain_first(worse: Sequence[str]) -> list[str]:
     """Write out the first of several worse tuners, which explains the format of the others.
 
@@ -252,3 +249,8 @@ def explain_first(worse: Sequence[str]) -> list[str]:
         for text in worse[:1]
     ]
     return [*first, *worse[1:]]
+
+
+def format_error_floor(statistics: ComparisonStatistics) -> str:
+    """State which errors count as equal."""
+    return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"

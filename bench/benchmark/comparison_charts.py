@@ -22,6 +22,7 @@ from bench.benchmark.statistics.training_amortisation import (
     build_time_per_target_table,
     find_cheapest_tuners,
     map_break_even_counts,
+    split_by_training,
 )
 from bench.benchmark.storage.result_folder import StoredComparison
 from bench.figures.style import MarkStyle, TunerStyles
@@ -454,7 +455,7 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
     tables, panels = [], []
     for level in view.levels:
         costs = view.statistics.tuning_costs[level]
-        searching, trained = split_by_training(view, level)
+        searching, trained = split_by_training(costs, view.style.order)
         x_axis = Axis("tuner that searches", names=tuple(searching))
         for kind in view.ranges:
             break_even_rows = map_break_even_counts(
@@ -480,32 +481,6 @@ def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
     return ComparisonChart(
         _select_panels_with_data(panels), {"even": pd.concat(tables)}, notes=_make_notes(view)
     )
-
-
-def split_by_training(view: ComparisonView, level: float) -> tuple[list[str], list[str]]:
-    """List the untrained tuners, and the trained ones that reach an error in some range.
-
-    Args:
-        view: Comparison with its statistics, experiment and styles of tuners.
-        level: The error threshold to be reached.
-
-    Returns:
-        Untrained tuners and trained tuners, each list in the order of the ranking.
-    """
-    costs_by_range = view.statistics.tuning_costs[level].values()
-    untrained, trained = [], []
-    for tuner in view.style.order:
-        costs = [by_tuner[tuner] for by_tuner in costs_by_range if tuner in by_tuner]
-        # A tuner without a run has no costs, and is in neither list.
-        if not costs:
-            continue
-        # Only a training uses simulations before the first target (`fit_simulations`).
-        if not any(cost.fit_simulations for cost in costs):
-            untrained.append(tuner)
-        # The expected running time (ERT) is infinite if no run reaches the error.
-        elif any(cost.effort.compute_ert() < float("inf") for cost in costs):
-            trained.append(tuner)
-    return untrained, trained
 
 
 CHARTS: Mapping[str, Callable[[ComparisonView], ComparisonChart]] = {

@@ -1,8 +1,6 @@
 """Write the tables, figures and report page of a comparison, and print a summary.
 
-The figures can also be drawn again with reference results in grey behind the error curves.
-
-Page of one comparison, report.html: its data, conclusion and limitations.
+The page, report.html, has the data, the conclusion and the limitations of the comparison.
 """
 
 from __future__ import annotations
@@ -16,10 +14,14 @@ from typing import Any
 
 import pandas as pd
 
-from bench.benchmark import comparison_printed_figures
 from bench.benchmark.best_tuner_summary import RangeResult, explain_first, format_error_floor
 from bench.benchmark.comparison_charts import CHARTS, ComparisonView, make_axis_labels
-from bench.benchmark.comparison_printed_figures import FIGURE_FILES, format_threshold_caption
+from bench.benchmark.comparison_printed_figures import (
+    FIGURE_FILES,
+    draw_figure,
+    format_threshold_caption,
+    list_figure_names,
+)
 from bench.benchmark.isolation.process_errors import ISOLATION_NOTE, without_isolation
 from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
 from bench.benchmark.problem.tuning_problem import numeric_warnings_silenced
@@ -39,19 +41,27 @@ from bench.benchmark.storage.result_folder import (
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER, read_plan
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES, FAILED_STATUSES
 from bench.figures.figure_layout import TRUSTED_TUNERS_NOTE
-from bench.figures.figure_output import (
-    FigureFiles,
-    render_all_formats,
-    write_figures,
-)
+from bench.figures.figure_output import FigureFiles, render_all_formats, write_figures
 from bench.pages.html_page import HtmlPage
 from bench.pages.template import render_text
 from sims.core.files import write_atomically
 
+REPORT_FILE = "report.html"
+"""File name of the report page in the folder of a comparison."""
+_PAGE_TEMPLATE = Path(__file__).with_name("comparison.html")
+"""Template of the report page."""
+_SUMMARY_TEMPLATE = Path(__file__).with_name("comparison.txt")
+"""Template of the printed summary."""
+_PAGE_DIGITS = 7
+"""Number of significant digits of values on the page that are in no file next to it."""
+_PRINTED_CHECKPOINTS = (3, 10)
+"""Numbers of simulations for printed errors along directions, in addition to the budget."""
+_TRACEBACK_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<function>\S+)')
+
 
 @dataclass(frozen=True)
 class ComparisonReportData:
-    """A comparison, as shown on its page.
+    """A comparison, as shown on its page and in the printed summary.
 
     Attributes:
         view: The comparison with its statistics, labels and styles.
@@ -77,105 +87,6 @@ class ComparisonReportData:
         for plugin in self.environment.get("plugins", ()):
             words += ["--plugin", plugin]
         return shlex.join(words)
-
-
-def list_failures(view: ComparisonView) -> list[dict[str, Any]]:
-    """List every kind of failure with its first reason, the most frequent one first.
-
-    Runs that failed or were skipped are grouped by tuner, status and reason.
-    """
-    statuses = view.stored.statuses
-    failed = statuses[statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
-    groups = failed.groupby(["tuner", "status", "reason"], sort=False)["run"]
-    counts = groups.agg(run_count="size", run="first").reset_index()
-    counts = counts.sort_values("run_count", ascending=False, kind="stable")
-    return [{str(key): value for key, value in row.items()} for row in counts.to_dict("records")]
-
-
-def collect_text_values(results: ComparisonReportData) -> dict[str, Any]:
-    """Collect the values of both templates, that of the page and that of the printed summary.
-
-    Args:
-        results: Comparison with its statistics and tables.
-
-    Returns:
-        Values by their names in the templates.
-    """
-    view = results.view
-    return {
-        "results": results,
-        "view": view,
-        "range_results": [RangeResult(view.statistics, kind) for kind in view.ranges],
-        "floor_text": format_error_floor(view.statistics),
-        "shown_label": view.format_metric_label(view.shown_metric),
-        "trust_note": TRUSTED_TUNERS_NOTE if view.experiment.trusted else "",
-        "target_count": sum(view.statistics.target_counts.values()),
-    }
-
-
-def list_mean_seconds(results: ComparisonReportData) -> list[tuple[str, dict[Hashable, Any]]]:
-    """List the tuners, best first, each with the row of table.csv at the end of its budget."""
-    table = results.tables["table"]
-    last = table[table["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
-    order = [tuner for tuner in results.view.statistics.order if tuner in last.index]
-    return list(zip(order, last.loc[order].to_dict("records"), strict=True))
-
-
-_PAGE_TEMPLATE = Path(__file__).with_name("comparison.html")
-_DIGITS = 7
-"""Number of significant digits of values that are in no file next to the page."""
-
-
-def render_page(results: ComparisonReportData) -> str:
-    """Render the HTML page of a comparison of tuners.
-
-    Tables and chart data are written into the page, from which its script draws the charts.
-
-    Args:
-        results: Comparison with its view, tables and the pictures that exist.
-
-    Returns:
-        The page, which needs no other file.
-    """
-    view = results.view
-    page = HtmlPage({FIGURE_FILES[name]: files for name, files in results.pictures.items()})
-    page.add_tables(results.tables)
-    # Every chart has a printed figure if it has data, except for that of running times (ERT).
-    charts = {
-        name: make_chart(view) if name in results.pictures or name == "ert" else None
-        for name, make_chart in CHARTS.items()
-    }
-    for chart in charts.values():
-        page.add_tables(chart.tables if chart else {}, _DIGITS)
-    statuses = view.stored.statuses
-    values = collect_text_values(results)
-    # Rankings by range; `together` has those of all ranges after the same number of simulations.
-    rankings = [result.rankings for result in values["range_results"]]
-    return page.render(
-        _PAGE_TEMPLATE,
-        **values,
-        charts=charts,
-        tuner_count=view.stored.runs["tuner"].nunique(),
-        run_count=view.stored.runs["run"].nunique(),
-        together=list(zip(*rankings, strict=True)) if all(rankings) else [],
-        explain_first=explain_first,
-        failed_count=int(statuses["status"].isin(FAILED_STATUSES).sum()),
-        skipped_count=statuses[statuses["status"] == "skipped"]["tuner"].nunique(),
-        failures=list_failures(view),
-        mean_seconds=list_mean_seconds(results),
-        last_simulations=str(int(results.tables["table"]["simulations"].max())),
-        threshold_caption=format_threshold_caption(view.statistics.runtime_thresholds),
-        stiff_threshold=f"{STIFF_SIGMA_THRESHOLD:g}",
-        targets_per_training=TARGETS_PER_TRAINING,
-        figure_files=FIGURE_FILES,
-    )
-
-
-REPORT_FILE = "report.html"
-"""File name of the report page in the folder of a comparison."""
-_TEMPLATE = Path(__file__).with_name("comparison.txt")
-_PRINTED_CHECKPOINTS = (3, 10)
-"""Numbers of simulations for printed errors along directions, in addition to the budget."""
 
 
 @numeric_warnings_silenced()
@@ -204,7 +115,7 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
     for name, frame in tables.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
     pictures = _render_figures(view)
-    files = {comparison_printed_figures.FIGURE_FILES[name]: pictures[name] for name in pictures}
+    files = {FIGURE_FILES[name]: pictures[name] for name in pictures}
     figures = [path for path in write_figures(folder, files) if path.suffix == ".png"]
     results = ComparisonReportData(
         view=view,
@@ -219,8 +130,8 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
 
     failed = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
     lines = render_text(
-        _TEMPLATE,
-        **collect_text_values(results),
+        _SUMMARY_TEMPLATE,
+        **_collect_text_values(results),
         error_tables=list(_list_error_tables(tables["table"], view)),
         failures=format_failures(failed),
         seconds=_build_run_seconds(results),
@@ -237,10 +148,8 @@ def write_report(folder: Path, print_line: Callable[[str], None]) -> int:
 def _render_figures(view: ComparisonView) -> dict[str, FigureFiles]:
     """Render all figures that exist for the comparison, by name."""
     return {
-        name: render_all_formats(
-            comparison_printed_figures.draw_figure(view.stored, view.labels, name, view.statistics)
-        )
-        for name in comparison_printed_figures.list_figure_names(view.stored)
+        name: render_all_formats(draw_figure(view.stored, view.labels, name, view.statistics))
+        for name in list_figure_names(view.stored)
     }
 
 
@@ -253,6 +162,104 @@ def _count_missing_runs(folder: Path, stored: StoredComparison) -> int:
     """
     plan = read_plan(folder) if (folder / SEGMENTS_FOLDER).exists() else None
     return max(len(plan) - int(stored.runs["run"].nunique()), 0) if plan else 0
+
+
+def _collect_text_values(results: ComparisonReportData) -> dict[str, Any]:
+    """Collect the values of both templates, that of the page and that of the printed summary.
+
+    Args:
+        results: Comparison with its statistics and tables.
+
+    Returns:
+        Values by their names in the templates.
+    """
+    view = results.view
+    return {
+        "results": results,
+        "view": view,
+        "range_results": [RangeResult(view.statistics, kind) for kind in view.ranges],
+        "floor_text": format_error_floor(view.statistics),
+        "shown_label": view.format_metric_label(view.shown_metric),
+        "trust_note": TRUSTED_TUNERS_NOTE if view.experiment.trusted else "",
+        "target_count": sum(view.statistics.target_counts.values()),
+    }
+
+
+def render_page(results: ComparisonReportData) -> str:
+    """Render the HTML page of a comparison of tuners.
+
+    Tables and chart data are written into the page, from which its script draws the charts.
+
+    Args:
+        results: Comparison with its view, tables and the pictures that exist.
+
+    Returns:
+        The page, which needs no other file.
+    """
+    view = results.view
+    page = HtmlPage({FIGURE_FILES[name]: files for name, files in results.pictures.items()})
+    page.add_tables(results.tables)
+    # Every chart has a printed figure if it has data, except for that of running times (ERT).
+    charts = {
+        name: make_chart(view) if name in results.pictures or name == "ert" else None
+        for name, make_chart in CHARTS.items()
+    }
+    for chart in charts.values():
+        page.add_tables(chart.tables if chart else {}, _PAGE_DIGITS)
+    statuses = view.stored.statuses
+    values = _collect_text_values(results)
+    # Rankings by range; `together` has those of all ranges after the same number of simulations.
+    rankings = [result.rankings for result in values["range_results"]]
+    return page.render(
+        _PAGE_TEMPLATE,
+        **values,
+        charts=charts,
+        tuner_count=view.stored.runs["tuner"].nunique(),
+        run_count=view.stored.runs["run"].nunique(),
+        together=list(zip(*rankings, strict=True)) if all(rankings) else [],
+        explain_first=explain_first,
+        failed_count=int(statuses["status"].isin(FAILED_STATUSES).sum()),
+        skipped_count=statuses[statuses["status"] == "skipped"]["tuner"].nunique(),
+        failures=_list_failures(view),
+        mean_seconds=_list_mean_seconds(results),
+        last_simulations=str(int(results.tables["table"]["simulations"].max())),
+        threshold_caption=format_threshold_caption(view.statistics.runtime_thresholds),
+        stiff_threshold=f"{STIFF_SIGMA_THRESHOLD:g}",
+        targets_per_training=TARGETS_PER_TRAINING,
+        figure_files=FIGURE_FILES,
+    )
+
+
+def _list_failures(view: ComparisonView) -> list[dict[str, Any]]:
+    """List every kind of failure with its first reason, the most frequent one first.
+
+    Runs that failed or were skipped are grouped by tuner, status and reason.
+    """
+    statuses = view.stored.statuses
+    failed = statuses[statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
+    groups = failed.groupby(["tuner", "status", "reason"], sort=False)["run"]
+    counts = groups.agg(run_count="size", run="first").reset_index()
+    counts = counts.sort_values("run_count", ascending=False, kind="stable")
+    return [{str(key): value for key, value in row.items()} for row in counts.to_dict("records")]
+
+
+def _list_mean_seconds(results: ComparisonReportData) -> list[tuple[str, dict[Hashable, Any]]]:
+    """List the tuners, best first, each with the row of table.csv at the end of its budget."""
+    table = results.tables["table"]
+    last = table[table["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
+    order = [tuner for tuner in results.view.statistics.order if tuner in last.index]
+    return list(zip(order, last.loc[order].to_dict("records"), strict=True))
+
+
+def _build_run_seconds(results: ComparisonReportData) -> pd.DataFrame:
+    """Build the table of mean seconds per run: tuner, simulations and training."""
+    columns = {
+        "tuner_seconds": "tuner",
+        "simulator_seconds": "simulator",
+        "fit_seconds": "one training",
+    }
+    rows = dict(_list_mean_seconds(results))
+    return pd.DataFrame.from_dict(rows, orient="index")[list(columns)].rename(columns=columns)
 
 
 def _list_error_tables(
@@ -325,17 +332,6 @@ def _build_direction_errors(
     return table, "heldout_error" in set(shown_lines["metric"])
 
 
-def _build_run_seconds(results: ComparisonReportData) -> pd.DataFrame:
-    """Build the table of mean seconds per run: tuner, simulations and training."""
-    columns = {
-        "tuner_seconds": "tuner",
-        "simulator_seconds": "simulator",
-        "fit_seconds": "one training",
-    }
-    rows = dict(list_mean_seconds(results))
-    return pd.DataFrame.from_dict(rows, orient="index")[list(columns)].rename(columns=columns)
-
-
 def format_failures(failed: pd.DataFrame) -> list[str]:
     """Format failures as lines, one for each tuner and status.
 
@@ -370,9 +366,6 @@ def format_failures(failed: pd.DataFrame) -> list[str]:
     isolated_tuners = list(dict.fromkeys(failed["tuner"][is_refused].astype(str)))
     note = [f"{', '.join(isolated_tuners)}: {ISOLATION_NOTE}"] if isolated_tuners else []
     return ["", "failures", *laid_out, *note]
-
-
-_TRACEBACK_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<function>\S+)')
 
 
 def format_failure_reason(reason: str) -> str:

@@ -1,4 +1,4 @@
-"""Plan a shot in the model that each tuner has fitted to the recording of a drop.
+"""Tune every method to the recording of a drop, and plan a shot with each tuned model.
 
 No code in this module uses the true ball. The models are those of the tuners, in the original
 simulator and in the one that `explain` extended from the same recording, and the fit of `explain`
@@ -29,11 +29,7 @@ from bench.bounce_shot.drop_recording import (
 )
 from bench.bounce_shot.shot_config import ShotConfig, get_ball_kind
 from bench.bounce_shot.shot_geometry import ShotGeometry
-from bench.bounce_shot.shot_planner import (
-    EffectCoefficients,
-    TunedModel,
-    plan_tuned_shot,
-)
+from bench.bounce_shot.shot_planner import EffectCoefficients, TunedModel, plan_tuned_shot
 from sims.core.simulator import Array, InputError, Scenario
 from sims.recording.recording import Recording, read_recording
 from sims.systems.ball import Ball as BallSimulator
@@ -41,12 +37,18 @@ from sims.systems.bounce_shot import ShotSystem
 
 UNTUNED_METHOD = "nominal"
 """Method without tuning."""
+
 EXPLAIN_METHOD = "explain"
 """Method that uses the fit of explain itself."""
+
 EXPLAIN_SUFFIX = " + explain"
 """Suffix of the label of a tuner that tunes the simulator extended by explain."""
+
 DEFAULT_GRAVITY = 9.81
 """Gravity of a recording that does not state it, m/s²."""
+
+ROW_CHANNEL = "v"
+"""Channel of the ball's row in the picture, pixels from above."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,45 @@ def tune_and_plan(
         ]
     radius = _get_run_constants(recording)["radius"]
     return [plan_tuned_shot(model, settings, inputs.scene, radius) for model in models]
+
+
+def make_failed_models(
+    experiment: Experiment, error: BaseException, status: str = "crashed"
+) -> list[TunedModel]:
+    """Make a failed model of each method, for a shot whose recording or planning failed.
+
+    None of them has a plan, so that the shot counts as a miss of every method. The methods are
+    those of `tune_and_plan`, in the same order.
+
+    Args:
+        experiment: the experiment with its tuners.
+        error: the error of the recording or of the worker.
+        status: status of the models; it is "timeout" if the error is a timeout.
+
+    Returns:
+        One model per method, without parameters and without a plan.
+    """
+    if isinstance(error, TimeoutError):
+        status = "timeout"
+    labels = [entry.label for entry in experiment.tuners]
+    methods = [
+        UNTUNED_METHOD,
+        *labels,
+        EXPLAIN_METHOD,
+        *(label + EXPLAIN_SUFFIX for label in labels),
+    ]
+    return [
+        TunedModel(
+            method,
+            restitution=math.nan,
+            effects={},
+            simulations=0,
+            seconds=math.nan,
+            status=status,
+            reason=str(error),
+        )
+        for method in methods
+    ]
 
 
 def _get_nominal_restitution() -> float:
@@ -316,10 +357,6 @@ def select_transferable_effects(
     return selected
 
 
-ROW_CHANNEL = "v"
-"""Channel of the ball's row in the picture, pixels from above."""
-
-
 def make_pixel_experiment(experiment: Experiment, settings: ShotConfig) -> Experiment:
     """Make the experiment for a tuner that sees pixel rows of a film and not the camera.
 
@@ -373,38 +410,3 @@ def build_pixel_runs(recording: Recording, experiment: Experiment, radius: float
     # Free fall from the release to the first seen height: z(t) = z(0) - g t^2 / 2.
     drop_height = float(heights[first] + 0.5 * gravity * run.times[first] ** 2)
     return ObservedRuns((Scenario(times, {"z": drop_height}, {}, {"radius": radius}),), observed)
-
-
-def make_failed_models(
-    experiment: Experiment, error: BaseException, status: str = "crashed"
-) -> list[TunedModel]:
-    """Make a failed model of each method, for a shot whose recording or planning failed.
-
-    None of them has a plan, so that the shot counts as a miss of every method.
-
-    Args:
-        experiment: the experiment with its tuners.
-        error: the error of the recording or of the worker.
-        status: status of the models; it is "timeout" if the error is a timeout.
-    """
-    if isinstance(error, TimeoutError):
-        status = "timeout"
-    labels = [entry.label for entry in experiment.tuners]
-    methods = [
-        UNTUNED_METHOD,
-        *labels,
-        EXPLAIN_METHOD,
-        *(label + EXPLAIN_SUFFIX for label in labels),
-    ]
-    return [
-        TunedModel(
-            method,
-            restitution=math.nan,
-            effects={},
-            simulations=0,
-            seconds=math.nan,
-            status=status,
-            reason=str(error),
-        )
-        for method in methods
-    ]

@@ -11,11 +11,7 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.problem.experiment_config import Experiment
-from bench.bounce_shot.drop_tuning import (
-    EXPLAIN_METHOD,
-    EXPLAIN_SUFFIX,
-    UNTUNED_METHOD,
-)
+from bench.bounce_shot.drop_tuning import EXPLAIN_METHOD, EXPLAIN_SUFFIX, UNTUNED_METHOD
 from bench.bounce_shot.hit_rate_table import ALL_BALLS
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import ExampleShot, execute_example
@@ -41,11 +37,13 @@ if TYPE_CHECKING:
 
 _GROUP_STYLES = {"untuned": (GREY, "s"), "tuned": (BLUE, "o"), "extended": (VERMILION, "D")}
 """Colour and marker of each group of methods."""
+
 _GROUP_LABELS = {
     "untuned": "untuned simulator",
     "tuned": "restitution tuned to one recorded drop",
     "extended": "simulator extended by explain from the same drop",
 }
+
 _MAX_MISS_RADII = 6
 """Range of the shown misses, in radii of the hoop."""
 
@@ -119,6 +117,37 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
     note = "each shot with a ball and a recorded drop of its own; bars: 95 % intervals (Wilson)"
     title = f"{experiment.title or experiment.name}\n{note}"
     return finish_chart(figure, axes[0], title, legend="outside right upper")
+
+
+def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
+    """Make the panel of a chart that shows the hit rate of each method by ball.
+
+    Args:
+        lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
+
+    Returns:
+        The panel, and its table: the lines with the position of their ball on the horizontal axis
+        as column ``place``.
+    """
+    # All balls together come first.
+    balls = [ALL_BALLS, *(ball for ball in dict.fromkeys(lines["ball"]) if ball != ALL_BALLS)]
+    places = {ball: place for place, ball in enumerate(balls)}
+    methods = dict.fromkeys(lines["method"])
+    styles = {method: get_mark_style(number) for number, method in enumerate(methods)}
+    series = make_method_series(
+        styles, "method", "rate", is_shifted=True, low="low", high="high", draw="points"
+    )
+    # Methods may have different numbers of shots, if some are missing.
+    counts = lines.groupby("ball")["shots"].agg(["min", "max"]).astype(int)
+    names = []
+    for ball in balls:
+        shot_counts = dict.fromkeys(counts.loc[ball].tolist())
+        names.append(f"{ball}\nn={'–'.join(map(str, shot_counts))}")
+    x_axis = Axis("ball; n shots of each method", names=tuple(names))
+    # A margin of 0.03, so that marks at 0 and 1 are visible.
+    y_axis = Axis("share of shots through the hoop", scales=("linear",), ends=(-0.03, 1.03))
+    panel = Panel("Hits by ball", "success", "place", series, x_axis, y_axis)
+    return panel, lines.assign(place=lines["ball"].map(places))
 
 
 def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
@@ -322,37 +351,6 @@ def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot
     right_limit = scene.hoop_x + 4 * scene.hoop_radius
     axis.set(xlim=(-0.25, right_limit), ylim=(-0.35, shot.top), aspect="equal")
     axis.spines[["top", "right"]].set_visible(False)
-
-
-def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
-    """Make the panel of a chart that shows the hit rate of each method by ball.
-
-    Args:
-        lines: table of `build_result_table`.
-
-    Returns:
-        The panel, and its table: the lines with the position of their ball on the horizontal axis
-        as column ``place``.
-    """
-    # All balls together come first.
-    balls = [ALL_BALLS, *(ball for ball in dict.fromkeys(lines["ball"]) if ball != ALL_BALLS)]
-    places = {ball: place for place, ball in enumerate(balls)}
-    methods = dict.fromkeys(lines["method"])
-    styles = {method: get_mark_style(number) for number, method in enumerate(methods)}
-    series = make_method_series(
-        styles, "method", "rate", is_shifted=True, low="low", high="high", draw="points"
-    )
-    # Methods may have different numbers of shots, if some are missing.
-    counts = lines.groupby("ball")["shots"].agg(["min", "max"]).astype(int)
-    names = []
-    for ball in balls:
-        shot_counts = dict.fromkeys(counts.loc[ball].tolist())
-        names.append(f"{ball}\nn={'–'.join(map(str, shot_counts))}")
-    x_axis = Axis("ball; n shots of each method", names=tuple(names))
-    # A margin of 0.03, so that marks at 0 and 1 are visible.
-    y_axis = Axis("share of shots through the hoop", scales=("linear",), ends=(-0.03, 1.03))
-    panel = Panel("Hits by ball", "success", "place", series, x_axis, y_axis)
-    return panel, lines.assign(place=lines["ball"].map(places))
 
 
 def find_path_end(path: Array, scene: ShotGeometry) -> int:

@@ -1,4 +1,8 @@
-"""Find the drop height with which a ball passes the hoop with the largest distance to its rim."""
+"""Plan shots in tuned models: find the drop height that keeps the ball farthest from the rim.
+
+`plan_shot` searches the height in any model. `plan_tuned_shot` makes the model from the result of a
+tuner, and stores the plan with it.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +19,21 @@ from sims.systems.bounce_shot import BounceShot
 
 _FIRST_GRID_SIZE = 48
 """Number of heights of the first grid, over the whole range."""
+
 _GRID_COUNT = 4
 """Number of successive grids, each around the best height of the previous one."""
+
 _LATER_GRID_SIZE = 9
 """Number of heights of each later grid, which covers two intervals of the previous one."""
+
 _FLIGHT_SECONDS = 3.0
 """Length of a simulated flight in seconds."""
+
 _SAMPLING_RATE = 240.0
 """Sampling rate in Hz; the crossing of the hoop's plane is interpolated linearly."""
 
 EffectCoefficients = Mapping[str, Sequence[float]]
+"""Coefficients of effects, by the name of the effect."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,33 @@ class ShotPlan:
     def is_found(self) -> bool:
         """True if a drop height was found."""
         return math.isfinite(self.height)
+
+
+@dataclass(frozen=True)
+class TunedModel:
+    """Tuned simulator and the shot planned in it.
+
+    Attributes:
+        method: label of the method.
+        restitution: tuned restitution.
+        effects: coefficients of the effects that explain added and that act on the shot.
+        simulations: number of simulations used on this target.
+        seconds: time used.
+        status: as in status.csv; ``no plan`` if the model reaches the hoop from no height.
+        reason: explanation of the status.
+        height: planned drop height, m; NaN if there is none.
+        margin: planned distance to the rim, m.
+    """
+
+    method: str
+    restitution: float
+    effects: EffectCoefficients
+    simulations: int
+    seconds: float
+    status: str
+    reason: str = ""
+    height: float = float("nan")
+    margin: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -76,6 +112,53 @@ class PlanningModel:
             for height in heights
         ]
         return self.simulator.simulate_batch(np.tile(self.theta, (len(heights), 1)), scenarios)
+
+
+def plan_tuned_shot(
+    model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
+) -> TunedModel:
+    """Plan a shot in a tuned model, and store the planned drop height and distance to the rim.
+
+    A method that crashed has no model and gets no plan. A finished method whose model reaches the
+    hoop from no height gets the status "no plan"; after another end, such as a timeout, the status
+    stays and the planned height is NaN.
+
+    Args:
+        model: simulator with the parameters that a tuner has found.
+        settings: settings of the bounce shot, from the table [shot] of the experiment.
+        scene: incline and hoop.
+        radius: radius of the ball, m.
+    """
+    if model.status == "crashed":
+        return model
+    plan = plan_shot(make_planning_model(model, settings, radius), scene, settings.heights)
+    if not plan.is_found and model.status in ("done", "converged"):
+        return replace(
+            model,
+            status="no plan",
+            reason="the model does not reach the hoop's plane from any height",
+        )
+    return replace(model, height=plan.height, margin=plan.rim_margin)
+
+
+def make_planning_model(model: TunedModel, settings: ShotConfig, radius: float) -> PlanningModel:
+    """Make the model in which a shot is planned: a bounce shot with the effects of a tuned model.
+
+    The drop does not show friction and moment of inertia of the ball, so they are assumed.
+
+    Args:
+        model: tuned model; its effects act with fixed coefficients.
+        settings: settings of the bounce shot, from the table [shot] of the experiment, with the
+            assumed friction and moment of inertia.
+        radius: radius of the ball, m.
+    """
+    constants = {
+        "radius": radius,
+        "friction": settings.planned_friction,
+        "inertia_ratio": settings.planned_inertia,
+    }
+    simulator = BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
+    return PlanningModel(simulator, np.array([model.restitution]), constants)
 
 
 def plan_shot(model: PlanningModel, scene: ShotGeometry, heights: tuple[float, float]) -> ShotPlan:
@@ -115,77 +198,3 @@ def plan_shot(model: PlanningModel, scene: ShotGeometry, heights: tuple[float, f
             max(low, best.height - spacing), min(high, best.height + spacing), _LATER_GRID_SIZE
         )
     return best
-
-
-@dataclass(frozen=True)
-class TunedModel:
-    """Tuned simulator and the shot planned in it.
-
-    Attributes:
-        method: label of the method.
-        restitution: tuned restitution.
-        effects: coefficients of the effects that explain added and that act on the shot.
-        simulations: number of simulations used on this target.
-        seconds: time used.
-        status: as in status.csv; ``no plan`` if the model reaches the hoop from no height.
-        reason: explanation of the status.
-        height: planned drop height, m; NaN if there is none.
-        margin: planned distance to the rim, m.
-    """
-
-    method: str
-    restitution: float
-    effects: EffectCoefficients
-    simulations: int
-    seconds: float
-    status: str
-    reason: str = ""
-    height: float = float("nan")
-    margin: float = float("nan")
-
-
-def make_planning_model(model: TunedModel, settings: ShotConfig, radius: float) -> PlanningModel:
-    """Make the model in which a shot is planned: a bounce shot with the effects of a tuned model.
-
-    The drop does not show friction and moment of inertia of the ball, so they are assumed.
-
-    Args:
-        model: tuned model; its effects act with fixed coefficients.
-        settings: settings of the bounce shot, from the table [shot] of the experiment, with the
-            assumed friction and moment of inertia.
-        radius: radius of the ball, m.
-    """
-    constants = {
-        "radius": radius,
-        "friction": settings.planned_friction,
-        "inertia_ratio": settings.planned_inertia,
-    }
-    simulator = BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
-    return PlanningModel(simulator, np.array([model.restitution]), constants)
-
-
-def plan_tuned_shot(
-    model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
-) -> TunedModel:
-    """Plan a shot in a tuned model, and store the planned drop height and distance to the rim.
-
-    A method that crashed has no model and gets no plan. A finished method whose model reaches the
-    hoop from no height gets the status "no plan"; after another end, such as a timeout, the status
-    stays and the planned height is NaN.
-
-    Args:
-        model: simulator with the parameters that a tuner has found.
-        settings: settings of the bounce shot, from the table [shot] of the experiment.
-        scene: incline and hoop.
-        radius: radius of the ball, m.
-    """
-    if model.status == "crashed":
-        return model
-    plan = plan_shot(make_planning_model(model, settings, radius), scene, settings.heights)
-    if not plan.is_found and model.status in ("done", "converged"):
-        return replace(
-            model,
-            status="no plan",
-            reason="the model does not reach the hoop's plane from any height",
-        )
-    return replace(model, height=plan.height, margin=plan.rim_margin)

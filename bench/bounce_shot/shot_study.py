@@ -28,7 +28,6 @@ from bench.benchmark.storage.run_status import (
 )
 from bench.bounce_shot import drop_tuning, true_world
 from bench.bounce_shot.drop_recording import RECORDINGS_FOLDER, record_drop
-from bench.bounce_shot.drop_tuning import make_failed_models
 from bench.bounce_shot.shot_config import ShotConfig, read_shot_config
 from bench.bounce_shot.shot_planner import TunedModel
 from bench.bounce_shot.shot_sampling import ShotSetup, draw_shots
@@ -323,13 +322,13 @@ class _ShotStages:
         step = self._progress("shooting", len(self._missing_shots))
         for index, error in recording_errors.items():
             status = "no recording" if isinstance(error, InputError) else "crashed"
-            failed_models = make_failed_models(self._experiment, error, status)
+            failed_models = drop_tuning.make_failed_models(self._experiment, error, status)
             self._store(index, failed_models, visible_share=0.0)
             step()
         for position, models in workers.iterate_results(calls, self._experiment.timeout):
             index = recorded[position]
             if isinstance(models, BaseException):
-                models = make_failed_models(self._experiment, models)
+                models = drop_tuning.make_failed_models(self._experiment, models)
             run = read_recording(self._paths[index], BallSimulator, whole=True).runs[0]
             visible_samples = float(np.isfinite(run.channels["z"]).sum())
             self._store(index, models, visible_samples / self._experiment.sampling.samples)

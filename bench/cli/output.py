@@ -1,10 +1,8 @@
-"""Print the results of commands as text or JSON.
+"""Print the results of commands as text or JSON, and build the JSON summaries of studies.
 
 A command is a function of its options and of `print_line`, which prints one line of text at once.
 It returns a `CommandResult`, which contains the same information as JSON. One of the two printers
 here prints either the one or the other; so every command has ``--json``, and errors have one form.
-
-Summary of a study's folder for the JSON documents of commands: its files and results.
 """
 
 from __future__ import annotations
@@ -22,13 +20,11 @@ from sims.core.json_documents import to_json_value
 if TYPE_CHECKING:
     from bench.benchmark.runner.study_base import Study
 
-
 JsonDocument = dict[str, Any]
 """Data that can be written as JSON after conversion by `to_json_value`."""
 PrintLine = Callable[[str], None]
 """Prints a line of text."""
 ErrorKind = Literal["usage", "input", "memory", "interrupted", "internal"]
-
 EXIT_OK = 0
 """Exit code of a command that succeeded."""
 EXIT_PROBLEMS_FOUND = 1
@@ -44,6 +40,8 @@ EXIT_CODES = {
     EXIT_INTERRUPTED: "interrupted; finished results are kept",
 }
 """Meaning of every exit code."""
+_FIGURES_FOLDER = "figures"
+"""Name of the folder of figures."""
 
 
 class CommandResult(NamedTuple):
@@ -135,10 +133,6 @@ def _flush_c() -> None:
         ctypes.CDLL(None).fflush(None)
     except (AttributeError, OSError, TypeError):  # C's library is not accessible in the program.
         return
-
-
-_FIGURES_FOLDER = "figures"
-"""Name of the folder of figures."""
 
 
 def summarise_study(study: Study) -> JsonDocument:

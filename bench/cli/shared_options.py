@@ -18,9 +18,8 @@ def add_options(
 ) -> None:
     """Add the options of a command that an options dataclass declares.
 
-    The decorators are in `bench.core.option_dataclasses`.
-
-    So options of the command line and arguments in Python are declared once. The annotation of a
+    The decorators of `bench.core.option_dataclasses` turn the same fields into arguments of
+    Python functions, so that options and arguments are declared once. The annotation of a
     field decides how a value is parsed, and its entry in the class docstring is the help.
 
     Fields of a type that has no parser here exist in Python only.

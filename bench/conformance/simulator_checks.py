@@ -11,7 +11,7 @@ import numpy as np
 from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
 from sims.core.simulator import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
 from sims.core.unit_cube import UnitCube
-from sims.own_simulator import OwnSimulator, get_checked_inertia, observed
+from sims.own_simulator import OwnSimulator, get_checked_inertia, get_observed_value
 from sims.recording.unit_conversion import is_unit
 
 _FORCED_STEPS = 20
@@ -61,7 +61,7 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
             observation = simulator.observe()
             for name in dict.fromkeys([*names, *kind.coordinates, *kind.rates, *kind.levels]):
                 # It raises an InputError unless the value is a number.
-                observed(simulator, observation, name)
+                get_observed_value(simulator, observation, name)
             if has_inertia:
                 _check_inertia(kind, get_checked_inertia(simulator))
             if has_forces:
@@ -148,7 +148,7 @@ def _compute_scaled_change(simulator: OwnSimulator, seconds: float, steps: int) 
     def observation() -> Array:
         readings = simulator.observe()
         return np.array(
-            [observed(simulator, readings, c.name) / c.scale for c in simulator.channels]
+            [get_observed_value(simulator, readings, c.name) / c.scale for c in simulator.channels]
         )
 
     _start_run(simulator)
@@ -220,7 +220,9 @@ def _simulate_motion(simulator: OwnSimulator, force: Array | None) -> Array:
     observed_samples = []
     for i in range(_FORCED_STEPS + 1):
         observation = simulator.observe()
-        observed_samples.append([observed(simulator, observation, name) for name in names])
+        observed_samples.append(
+            [get_observed_value(simulator, observation, name) for name in names]
+        )
         if force is not None:
             simulator.apply_force(force if i == 0 else np.zeros_like(force))
         _make_step(simulator)

@@ -1,6 +1,7 @@
-"""Sample subjects on which checks run: a toy problem, a tank and a robot arm.
+"""Toy systems on which conformance checks run: a tuning problem, a tank and a robot arm.
 
-Parameter i has the rate r_i = 0.5 + 0.6 p_i. The two channels are the sums over i = 1, 2, ... of
+Parameter i of the tuning problem has the rate r_i = 0.5 + 0.6 p_i. Its two channels are the sums
+over i = 1, 2, ... of
 
     cos(r_i t + 0.3 i) / i            (1)
     exp(-r_i t) (1 + 0.1 i)           (2)
@@ -190,10 +191,10 @@ _TESTED_CONTACT = "table/ball"
 """Contact at which effects at contacts act."""
 
 OBSERVED_CHANNELS = ("q.shoulder", "q.elbow", "qd.shoulder", "tau.elbow", "s.wrist.y")
-"""Observed channels, one of each kind."""
+"""Observed channels of the arm, one of each kind."""
 
 _RUN_SECONDS = 0.8
-"""Duration of a run in seconds."""
+"""Duration of a run of the arm in seconds."""
 
 
 @lru_cache(maxsize=1)
@@ -216,8 +217,8 @@ def make_arm_simulator(effect: type[Effect]) -> type[RobotSimulator]:
     return make_robot_simulator(robot)
 
 
-def make_scenario() -> Scenario:
-    """Make a run in which both joints reverse and every command changes."""
+def make_arm_scenario() -> Scenario:
+    """Make a run of the arm in which both joints reverse and every command changes."""
     # The first samples are at the ends of simulation steps, the others between them.
     times = np.concatenate([np.arange(0.0, 0.3, 0.02), np.arange(0.301, _RUN_SECONDS, 0.021)])
     # Arbitrary angles (rad) and rates (rad/s), and torques (N m) that change every 0.2 s.

@@ -46,90 +46,105 @@ from methods.tuner import (
 )
 from sims.core.simulator import Array
 
+_NAME = re.compile(r"[a-z][a-z0-9_-]*$")
+"""Pattern of a tuner's name."""
 _RUN_SIMULATIONS = 5
 """Number of simulations of a run, enough for a tuner to use all of its features."""
 _SEED = 0
 """Seed of the runs that are compared."""
 _SIGNIFICANCE_LEVEL = 0.05
 """Significance level of the comparison with random search, over all targets together."""
-
+_SEQUENTIAL_TEST_TARGETS = (6, 12, 24)
+"""Numbers of targets after which random search is compared, each at a third of 5 %."""
 FIT_BUDGET = 240
 """Number of training simulations of a trained tuner; small, so that the suite is fast."""
-
 TRAINED_TUNERS: dict[tuple[type[Tuner], int], dict[str, Array]] = {}
 """Trained state of each tuner in this process, by class and dimension, because training is slow."""
 
 
-def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
-    """Check that the tuner runs in an isolated process, with the same result as in this process.
-
-    An isolated process cannot start other processes and cannot access files or the network. A tuner
-    that a comparison evaluates runs in such a process.
+def make_trained_tuner(kind: type[Tuner], dim: int = 2, anew: bool = False) -> Tuner:
+    """Make a tuner, trained on the toy problem if necessary.
 
     Args:
-        kind: Tuner class under test.
-
-    Returns:
-        A reason why the check is not applicable; None if it passed.
+        kind: class of the tuner.
+        dim: number of parameters.
+        anew: whether to train again instead of using the cached state.
     """
-    tuned = _make_tuner_spec(kind)
-    if tuned is None:
-        return NotApplicable("its class is in no plugin file and no installed package")
-    local_trace = run_tuner(make_trained_tuner(kind), budget=_RUN_SIMULATIONS, seed=_SEED)
-    state = make_trained_tuner(kind).state() if kind.learned else None
-    task, _ = make_task(budget=_RUN_SIMULATIONS)
-    location = f"{kind.__name__}: what needs files, the network or processes; docs/isolation.md"
-    try:
-        with start_isolated_tuner(tuned, _SEED, "run", state=state) as tuner:
-            # The isolated process makes the same random generator from this seed.
-            seed_words = np.array([_SEED], dtype=np.uint32)
-            isolated_run = IsolatedRun(tuner, seed_words, float("inf"))
-            isolated_trace = drive_tuner(
-                isolated_run, task, make_evaluate(task), np.random.default_rng(_SEED)
+    tuner = kind()
+    if not anew and (kind, dim) in TRAINED_TUNERS:
+        tuner.restore(TRAINED_TUNERS[kind, dim])
+        return tuner
+    tuner.fit(ToyTrainingSimulator(dim), np.random.default_rng(0), FIT_BUDGET)
+    if kind.learned:
+        TRAINED_TUNERS[kind, dim] = tuner.state()
+    return tuner
+
+
+def run_tuner(
+    tuner: Tuner,
+    budget: int,
+    dim: int = 2,
+    seed: int = 0,
+    fails: Callable[[int], bool] = lambda _: False,
+    target: int = 0,
+) -> RunTrace:
+    """Run a tuner on the toy problem.
+
+    Args:
+        tuner: instance of the tuner.
+        budget: maximum number of simulations.
+        dim: number of parameters.
+        seed: seed of the run.
+        fails: returns whether simulation number k fails.
+        target: seed of the task.
+    """
+    task, _ = make_task(budget, dim, target)
+    evaluate = make_evaluate(task, fails)
+    return drive_tuner(tuner, task, evaluate, np.random.default_rng(seed))
+
+
+class ToyTrainingSimulator:
+    """Training simulator of the toy problem; see `methods.tuner.TrainingSimulator`."""
+
+    def __init__(self, dim: int) -> None:
+        """Set the sizes of the toy problem: two channels of 40 samples, and `dim` parameters."""
+        self.dim, self.scale = dim, np.ones(2)
+        self.lengths: tuple[int, ...] = (SAMPLE_TIMES.size,)
+        self.scene = EMPTY_SCENE
+        self.training = np.array([[TRAINING_RANGE_LOW] * dim, [TRAINING_RANGE_HIGH] * dim])
+        self.used, self.budget = 0, FIT_BUDGET
+
+    def sample(self, rng: np.random.Generator, n: int) -> Array:
+        """Draw parameters uniformly from the training range.
+
+        Args:
+            rng: random generator.
+            n: number of points.
+        """
+        return rng.uniform(TRAINING_RANGE_LOW, TRAINING_RANGE_HIGH, size=(n, self.dim))
+
+    def simulate(self, rng: np.random.Generator, points: Array) -> Array:  # noqa: ARG002
+        """Simulate points, and count the simulations.
+
+        Args:
+            rng: not used.
+            points: points in the unit cube, (n, dim).
+
+        Returns:
+            Observations, (n, 40, 2).
+
+        Raises:
+            CheckError: a point is outside the training range.
+            BudgetExceededError: the training budget is exceeded.
+        """
+        if not ((points >= TRAINING_RANGE_LOW) & (points <= TRAINING_RANGE_HIGH)).all():
+            raise CheckError(
+                "expected training inside the training range; found a point outside; see `fit`"
             )
-    except (RunEndedError, KilledExternallyError) as error:
-        last_line = str(error).strip().splitlines()[-1:]
-        raise CheckError(
-            f"expected a run in a process of its own; found {last_line}; see {location}"
-        ) from None
-    end_text = (
-        isolated_trace.reason.strip().splitlines()[-1:]
-        if isolated_trace.status != local_trace.status
-        else ""
-    )
-    check(
-        isolated_trace.status == local_trace.status,
-        f"the status {local_trace.status} when isolated",
-        end_text,
-        location,
-    )
-    is_same = np.array_equal(isolated_trace.proposals, local_trace.proposals)
-    check(is_same, "the same run when isolated", "another one", location)
-    return None
-
-
-def _make_tuner_spec(kind: type[Tuner]) -> TunerSpec | None:
-    """Return the tuner specification for an isolated process; None if the class cannot load.
-
-    The specification says from which module or plugin file another process loads the class.
-
-    Args:
-        kind: Tuner class under test.
-    """
-    module = sys.modules.get(kind.__module__)
-    # A class that a function or a notebook cell defines is not in its module under its name.
-    if getattr(module, kind.__name__, None) is not kind:
-        return None
-    file = inspect.getsourcefile(kind) or ""
-    if kind.__module__.startswith("simgap_plugin_"):
-        return TunerSpec(kind.name, "", file, {}, find_preloadable_packages(file))
-    # A class of a script or a test is in a file that an isolated process cannot read.
-    if not (file.startswith(str(PROJECT_ROOT / "methods")) or "site-packages" in file):
-        return None
-    return TunerSpec(kind.name, kind.__module__, "", {}, find_preloadable_packages(file))
-
-
-_NAME = re.compile(r"[a-z][a-z0-9_-]*$")
+        self.used += len(points)
+        if self.used > self.budget:
+            raise BudgetExceededError(f"{self.used} training simulations, {self.budget} allowed")
+        return simulate_toy_problem(points)
 
 
 def _check_run_completed(kind: type[Tuner], trace: RunTrace, condition: str) -> None:
@@ -414,10 +429,6 @@ def check_easy_problem_is_improved(kind: type[Tuner]) -> None:
     )
 
 
-_SEQUENTIAL_TEST_TARGETS = (6, 12, 24)
-"""Numbers of targets after which random search is compared, each at a third of 5 %."""
-
-
 def check_beats_random_search(kind: type[Tuner]) -> None:
     """Check that errors after 30 simulations on the easy problem are below those of random search.
 
@@ -527,6 +538,75 @@ def check_same_run_in_other_processes(kind: type[Tuner]) -> None:
         )
 
 
+def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
+    """Check that the tuner runs in an isolated process, with the same result as in this process.
+
+    An isolated process cannot start other processes and cannot access files or the network. A tuner
+    that a comparison evaluates runs in such a process.
+
+    Args:
+        kind: Tuner class under test.
+
+    Returns:
+        A reason why the check is not applicable; None if it passed.
+    """
+    tuned = _make_tuner_spec(kind)
+    if tuned is None:
+        return NotApplicable("its class is in no plugin file and no installed package")
+    local_trace = run_tuner(make_trained_tuner(kind), budget=_RUN_SIMULATIONS, seed=_SEED)
+    state = make_trained_tuner(kind).state() if kind.learned else None
+    task, _ = make_task(budget=_RUN_SIMULATIONS)
+    location = f"{kind.__name__}: what needs files, the network or processes; docs/isolation.md"
+    try:
+        with start_isolated_tuner(tuned, _SEED, "run", state=state) as tuner:
+            # The isolated process makes the same random generator from this seed.
+            seed_words = np.array([_SEED], dtype=np.uint32)
+            isolated_run = IsolatedRun(tuner, seed_words, float("inf"))
+            isolated_trace = drive_tuner(
+                isolated_run, task, make_evaluate(task), np.random.default_rng(_SEED)
+            )
+    except (RunEndedError, KilledExternallyError) as error:
+        last_line = str(error).strip().splitlines()[-1:]
+        raise CheckError(
+            f"expected a run in a process of its own; found {last_line}; see {location}"
+        ) from None
+    end_text = (
+        isolated_trace.reason.strip().splitlines()[-1:]
+        if isolated_trace.status != local_trace.status
+        else ""
+    )
+    check(
+        isolated_trace.status == local_trace.status,
+        f"the status {local_trace.status} when isolated",
+        end_text,
+        location,
+    )
+    is_same = np.array_equal(isolated_trace.proposals, local_trace.proposals)
+    check(is_same, "the same run when isolated", "another one", location)
+    return None
+
+
+def _make_tuner_spec(kind: type[Tuner]) -> TunerSpec | None:
+    """Return the tuner specification for an isolated process; None if the class cannot load.
+
+    The specification says from which module or plugin file another process loads the class.
+
+    Args:
+        kind: Tuner class under test.
+    """
+    module = sys.modules.get(kind.__module__)
+    # A class that a function or a notebook cell defines is not in its module under its name.
+    if getattr(module, kind.__name__, None) is not kind:
+        return None
+    file = inspect.getsourcefile(kind) or ""
+    if kind.__module__.startswith("simgap_plugin_"):
+        return TunerSpec(kind.name, "", file, {}, find_preloadable_packages(file))
+    # A class of a script or a test is in a file that an isolated process cannot read.
+    if not (file.startswith(str(PROJECT_ROOT / "methods")) or "site-packages" in file):
+        return None
+    return TunerSpec(kind.name, kind.__module__, "", {}, find_preloadable_packages(file))
+
+
 def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> NotApplicable | None:
     """Check that `state` and `restore` round-trip, and that the state of another tuner is rejected.
 
@@ -572,7 +652,6 @@ def check_instances_can_be_sent_to_workers(kind: type[Tuner]) -> None:
 
 _RUNS = check_runs_in_one_and_in_ten_dimensions
 _REPEATS = check_same_seed_gives_the_same_run
-
 TUNER_CHECKS: Mapping[Check, tuple[Check, ...]] = {
     check_api_is_complete: (),
     _RUNS: (check_api_is_complete,),
@@ -592,88 +671,3 @@ TUNER_CHECKS: Mapping[Check, tuple[Check, ...]] = {
     check_same_run_when_sealed: (check_same_run_in_other_processes,),
 }
 """Checks in the order in which they run, each with those that must pass for it to be meaningful."""
-
-
-class ToyTrainingSimulator:
-    """Training simulator of the toy problem; see `methods.tuner.TrainingSimulator`."""
-
-    def __init__(self, dim: int) -> None:
-        """Set the sizes of the toy problem: two channels of 40 samples, and `dim` parameters."""
-        self.dim, self.scale = dim, np.ones(2)
-        self.lengths: tuple[int, ...] = (SAMPLE_TIMES.size,)
-        self.scene = EMPTY_SCENE
-        self.training = np.array([[TRAINING_RANGE_LOW] * dim, [TRAINING_RANGE_HIGH] * dim])
-        self.used, self.budget = 0, FIT_BUDGET
-
-    def sample(self, rng: np.random.Generator, n: int) -> Array:
-        """Draw parameters uniformly from the training range.
-
-        Args:
-            rng: random generator.
-            n: number of points.
-        """
-        return rng.uniform(TRAINING_RANGE_LOW, TRAINING_RANGE_HIGH, size=(n, self.dim))
-
-    def simulate(self, rng: np.random.Generator, points: Array) -> Array:  # noqa: ARG002
-        """Simulate points, and count the simulations.
-
-        Args:
-            rng: not used.
-            points: points in the unit cube, (n, dim).
-
-        Returns:
-            Observations, (n, 40, 2).
-
-        Raises:
-            CheckError: a point is outside the training range.
-            BudgetExceededError: the training budget is exceeded.
-        """
-        if not ((points >= TRAINING_RANGE_LOW) & (points <= TRAINING_RANGE_HIGH)).all():
-            raise CheckError(
-                "expected training inside the training range; found a point outside; see `fit`"
-            )
-        self.used += len(points)
-        if self.used > self.budget:
-            raise BudgetExceededError(f"{self.used} training simulations, {self.budget} allowed")
-        return simulate_toy_problem(points)
-
-
-def make_trained_tuner(kind: type[Tuner], dim: int = 2, anew: bool = False) -> Tuner:
-    """Make a tuner, trained on the toy problem if necessary.
-
-    Args:
-        kind: class of the tuner.
-        dim: number of parameters.
-        anew: whether to train again instead of using the cached state.
-    """
-    tuner = kind()
-    if not anew and (kind, dim) in TRAINED_TUNERS:
-        tuner.restore(TRAINED_TUNERS[kind, dim])
-        return tuner
-    tuner.fit(ToyTrainingSimulator(dim), np.random.default_rng(0), FIT_BUDGET)
-    if kind.learned:
-        TRAINED_TUNERS[kind, dim] = tuner.state()
-    return tuner
-
-
-def run_tuner(
-    tuner: Tuner,
-    budget: int,
-    dim: int = 2,
-    seed: int = 0,
-    fails: Callable[[int], bool] = lambda _: False,
-    target: int = 0,
-) -> RunTrace:
-    """Run a tuner on the toy problem.
-
-    Args:
-        tuner: instance of the tuner.
-        budget: maximum number of simulations.
-        dim: number of parameters.
-        seed: seed of the run.
-        fails: returns whether simulation number k fails.
-        target: seed of the task.
-    """
-    task, _ = make_task(budget, dim, target)
-    evaluate = make_evaluate(task, fails)
-    return drive_tuner(tuner, task, evaluate, np.random.default_rng(seed))

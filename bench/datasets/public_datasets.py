@@ -1,18 +1,14 @@
-"""Catalogue of the data sets in datasets.toml, and their folders on this machine.
+"""Public data sets of datasets.toml: their folders on this machine, and their download.
 
-Download a data set, check every file, convert it to the recording format, and write its folder.
-
-Either the whole folder is written or nothing.
+A download checks every file against its published hash, converts it to the recording format where
+needed, and writes the whole folder or nothing.
 """
 
 from __future__ import annotations
 
 import hashlib
-import http.client
 import io
 import os
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -28,6 +24,39 @@ from sims.core.toml_validation import tomllib
 
 FOLDER_VARIABLES = {"recording": "SIMGAP_DATA", "robot": "SIMGAP_ROBOTS"}
 """Environment variables with the folder of data sets, by kind of data set."""
+_TIMEOUT = 30.0
+"""Timeout for a server that sends no data, seconds."""
+_READ_BLOCK_BYTES = 1 << 16
+"""Number of bytes that are read at a time."""
+_PERIOD_MS = 1
+"""Sample period of the published file of the free swing, ms."""
+_DECIMATION = 5
+"""Decimation factor of the free swing: every fifth sample is kept, which gives 200 Hz."""
+_SAMPLES_PER_RUN = 1000
+"""Number of samples of a run of the free swing: 5 s at 200 Hz."""
+_HELD_OUT_FROM = 7
+"""Number of the first held-out run of the free swing."""
+_DECIMALS = 6
+"""Number of decimals to which its angles and rates are rounded; an encoder step is 1e-3 rad."""
+_FREE_SWING = """system = "pendulum"
+title = "Single pendulum, free swing, encoder"
+
+[channels.q]
+unit = "rad"      # 0 = hanging straight down
+
+[channels.qd]
+unit = "rad/s"
+
+[constants]
+mass = 0.1476     # kg, bob and rod
+length = 0.1478   # m, hinge to centre of mass
+gravity = 9.81    # m/s^2
+"""
+"""Description (TOML) of the free swing, without its runs."""
+Advance = Callable[[int], None]
+"""Callback with the number of bytes received."""
+Conversion = Callable[[Mapping[str, bytes]], dict[str, Content]]
+"""Function from the contents of a data set's files, by name, to the files to write, by name."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +95,7 @@ class DataSet:
         cite: authors and paper.
         provides: names of the files that commands read from its folder.
         files: files to download.
-        conversion: key of `public_datasets.CONVERSIONS`; empty if the files are used
-            without conversion.
+        conversion: key of `CONVERSIONS`; empty if the files are used without conversion.
     """
 
     name: str
@@ -137,6 +165,20 @@ def list_search_folders(kind: str) -> Iterator[Path]:
     if stated_folder:
         yield Path(stated_folder)
     yield get_user_folder()
+
+
+def find_present_folder(data_set: DataSet, target_folder: Path | None) -> Path | None:
+    """Return the folder of a data set that is already present; None if it must be downloaded.
+
+    Args:
+        data_set: data set of the catalogue: its files, source and licence.
+        target_folder: folder below which it may be; None for the usual ones.
+    """
+    if target_folder is None:
+        return data_set.folder()
+    # In a named folder the files themselves are looked for.
+    folder = target_folder / data_set.name
+    return folder if all((folder / file).is_file() for file in data_set.provides) else None
 
 
 def find(kind: str, path: str) -> Path | None:
@@ -214,115 +256,6 @@ def _make_data_set(name: str, table: dict[str, object]) -> DataSet:
         provides=tuple(provides),
         **other_entries,  # type: ignore[arg-type]  # keys of the package's own file
     )
-
-
-Conversion = Callable[[Mapping[str, bytes]], dict[str, Content]]
-"""Function from the contents of a data set's files, by name, to the files to write, by name."""
-
-_PERIOD_MS = 1
-"""Sample period of the published file, ms."""
-_DECIMATION = 5
-"""Decimation factor: every fifth sample is kept, which gives 200 Hz."""
-_SAMPLES_PER_RUN = 1000
-"""Number of samples of a run: 5 s at 200 Hz."""
-_HELD_OUT_FROM = 7
-"""Number of the first held-out run."""
-_DECIMALS = 6
-"""Number of decimals to which angles and rates are rounded; an encoder step is 1e-3 rad."""
-
-_FREE_SWING = """system = "pendulum"
-title = "Single pendulum, free swing, encoder"
-
-[channels.q]
-unit = "rad"      # 0 = hanging straight down
-
-[channels.qd]
-unit = "rad/s"
-
-[constants]
-mass = 0.1476     # kg, bob and rod
-length = 0.1478   # m, hinge to centre of mass
-gravity = 9.81    # m/s^2
-"""
-
-
-def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
-    """Convert the free swing of the single pendulum to a recording with runs of 5 s.
-
-    The MATLAB file holds one swing, sampled every 1 ms and divided into pieces: ``Y_id`` and
-    ``Y_vad`` are cell arrays of pieces (2, T) with angles in rad (pi is hanging) and rates in
-    rad/s. The pieces are joined, every fifth sample is kept, and the angle is measured from
-    hanging. Runs from number 7 on are held out. The samples after the last whole run are left out.
-
-    Args:
-        files: Contents of the downloaded files by name.
-
-    Returns:
-        Table (CSV) and description (TOML) by file name.
-
-    Raises:
-        InputError: the file does not have this form.
-    """
-    (name,) = [name for name in files if name.endswith(".mat")]
-    angles, rates = _join_records(name, files[name])[:, ::_DECIMATION]
-    q = np.round(angles, _DECIMALS) - np.pi
-    qd = np.round(rates, _DECIMALS)
-    run_count = q.size // _SAMPLES_PER_RUN
-    if run_count == 0:
-        raise InputError(
-            f"{name}: expected at least {_SAMPLES_PER_RUN * _DECIMATION} samples of 1 ms"
-        )
-    # Index of the run, and of the sample in its run, for each row of the table.
-    run_indices, samples = np.divmod(np.arange(run_count * _SAMPLES_PER_RUN), _SAMPLES_PER_RUN)
-    t = samples * _DECIMATION * _PERIOD_MS / 1000  # s
-    columns = (run_indices + 1, t, q[: t.size], qd[: t.size])
-    table = io.StringIO()
-    np.savetxt(table, np.stack(columns, axis=1), "%.7g", ",", header="run,t,q,qd", comments="")
-    held_out = range(_HELD_OUT_FROM, run_count + 1)
-    description = _FREE_SWING + "".join(f"\n[runs.{run}]\nheld_out = true\n" for run in held_out)
-    return {"recording.csv": table.getvalue(), "recording.toml": description}
-
-
-def _join_records(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Join the angles and rates (2, T) of all pieces of a MATLAB file, in their order.
-
-    The pieces are entries of the cell arrays ``Y_id`` and, after them, ``Y_vad``.
-
-    Args:
-        name: name of the file, for messages.
-        content: content of the file.
-
-    Raises:
-        InputError: the file is damaged or has another form.
-    """
-    from scipy.io import loadmat
-
-    try:
-        arrays = loadmat(io.BytesIO(content))  # type: ignore[arg-type]  # the stubs know no streams
-        records = [record for key in ("Y_id", "Y_vad") for record in arrays[key].ravel()]
-        joined_samples = np.concatenate([np.asarray(record, float) for record in records], axis=1)
-    except Exception as error:  # the reader raises various errors for a damaged file
-        reason = f"{type(error).__name__}: {error}"
-        expected = "a MATLAB file with cell arrays Y_id and Y_vad of (2, T) numbers"
-        raise InputError(f"{name}: expected {expected} ({reason})") from None
-    if joined_samples.shape[0] != 2:
-        raise InputError(
-            f"{name}: expected 2 rows in Y_id and Y_vad, found {joined_samples.shape[0]}"
-        )
-    return joined_samples
-
-
-CONVERSIONS: Mapping[str, Conversion] = {"free_swing": free_swing}
-"""Conversions by their names in datasets.toml."""
-
-
-_TIMEOUT = 30.0
-"""Timeout for a server that sends no data, seconds."""
-_READ_BLOCK_BYTES = 1 << 16
-"""Number of bytes that are read at a time."""
-
-Advance = Callable[[int], None]
-"""Callback with the number of bytes received."""
 
 
 def download(
@@ -444,6 +377,11 @@ def _download_content(url: str, data_set: DataSet, file: SourceFile, advance: Ad
     Raises:
         InputError: The file cannot be downloaded.
     """
+    # Most commands only look up data sets and do not download them.
+    import http.client
+    import urllib.error
+    import urllib.request
+
     remedy = (
         f"download it by other means and give its folder with `{data_set.command} --from FOLDER`"
     )
@@ -535,15 +473,71 @@ def _write_folder(target: Path, contents: dict[str, Content]) -> None:
         raise InputError(f"{target}: cannot be written ({error.strerror}); {remedy}") from None
 
 
-def find_present_folder(data_set: DataSet, target_folder: Path | None) -> Path | None:
-    """Return the folder of a data set that is already present; None if it must be downloaded.
+def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
+    """Convert the free swing of the single pendulum to a recording with runs of 5 s.
+
+    The MATLAB file holds one swing, sampled every 1 ms and divided into pieces: ``Y_id`` and
+    ``Y_vad`` are cell arrays of pieces (2, T) with angles in rad (pi is hanging) and rates in
+    rad/s. The pieces are joined, every fifth sample is kept, and the angle is measured from
+    hanging. Runs from number 7 on are held out. The samples after the last whole run are left out.
 
     Args:
-        data_set: data set of the catalogue: its files, source and licence.
-        target_folder: folder below which it may be; None for the usual ones.
+        files: Contents of the downloaded files by name.
+
+    Returns:
+        Table (CSV) and description (TOML) by file name.
+
+    Raises:
+        InputError: the file does not have this form.
     """
-    if target_folder is None:
-        return data_set.folder()
-    # In a named folder the files themselves are looked for.
-    folder = target_folder / data_set.name
-    return folder if all((folder / file).is_file() for file in data_set.provides) else None
+    (name,) = [name for name in files if name.endswith(".mat")]
+    angles, rates = _join_records(name, files[name])[:, ::_DECIMATION]
+    q = np.round(angles, _DECIMALS) - np.pi
+    qd = np.round(rates, _DECIMALS)
+    run_count = q.size // _SAMPLES_PER_RUN
+    if run_count == 0:
+        raise InputError(
+            f"{name}: expected at least {_SAMPLES_PER_RUN * _DECIMATION} samples of 1 ms"
+        )
+    # Index of the run, and of the sample in its run, for each row of the table.
+    run_indices, samples = np.divmod(np.arange(run_count * _SAMPLES_PER_RUN), _SAMPLES_PER_RUN)
+    t = samples * _DECIMATION * _PERIOD_MS / 1000  # s
+    columns = (run_indices + 1, t, q[: t.size], qd[: t.size])
+    table = io.StringIO()
+    np.savetxt(table, np.stack(columns, axis=1), "%.7g", ",", header="run,t,q,qd", comments="")
+    held_out = range(_HELD_OUT_FROM, run_count + 1)
+    description = _FREE_SWING + "".join(f"\n[runs.{run}]\nheld_out = true\n" for run in held_out)
+    return {"recording.csv": table.getvalue(), "recording.toml": description}
+
+
+def _join_records(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Join the angles and rates (2, T) of all pieces of a MATLAB file, in their order.
+
+    The pieces are entries of the cell arrays ``Y_id`` and, after them, ``Y_vad``.
+
+    Args:
+        name: name of the file, for messages.
+        content: content of the file.
+
+    Raises:
+        InputError: the file is damaged or has another form.
+    """
+    from scipy.io import loadmat
+
+    try:
+        arrays = loadmat(io.BytesIO(content))  # type: ignore[arg-type]  # the stubs know no streams
+        records = [record for key in ("Y_id", "Y_vad") for record in arrays[key].ravel()]
+        joined_samples = np.concatenate([np.asarray(record, float) for record in records], axis=1)
+    except Exception as error:  # the reader raises various errors for a damaged file
+        reason = f"{type(error).__name__}: {error}"
+        expected = "a MATLAB file with cell arrays Y_id and Y_vad of (2, T) numbers"
+        raise InputError(f"{name}: expected {expected} ({reason})") from None
+    if joined_samples.shape[0] != 2:
+        raise InputError(
+            f"{name}: expected 2 rows in Y_id and Y_vad, found {joined_samples.shape[0]}"
+        )
+    return joined_samples
+
+
+CONVERSIONS: Mapping[str, Conversion] = {"free_swing": free_swing}
+"""Conversions by their names in datasets.toml."""

@@ -8,8 +8,6 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from bench.benchmark.isolation.resource_limits import limit_to_one_thread
 from bench.diagnosis.evaluation.forked_workers import ForkedWorkerPool
 from bench.diagnosis.evaluation.parameter_bounds import describe_unusual_values
@@ -22,7 +20,12 @@ from bench.diagnosis.numerics_cause import (
     list_option_causes,
     list_step_causes,
 )
-from bench.diagnosis.pipeline.base_model import SEGMENT_DURATIONS, BaseModel, filter_and_fit
+from bench.diagnosis.pipeline.base_model import (
+    BaseModel,
+    DivergingSimulationError,
+    filter_and_fit,
+    make_simulation_error,
+)
 from bench.diagnosis.pipeline.cause_search import CauseSearch
 from bench.diagnosis.pipeline.convention_and_unit_checks import (
     RecordingErrorCheck,
@@ -32,25 +35,18 @@ from bench.diagnosis.pipeline.extended_simulator_builder import build_extended_s
 from bench.diagnosis.pipeline.recording_preparation import RecordingSource, prepare_runs
 from bench.diagnosis.pipeline.report_data_builder import build_report_data
 from bench.diagnosis.pipeline.search_result import SearchResult
-from bench.diagnosis.pipeline.segment_choice import leave_out_jumps
+from bench.diagnosis.pipeline.segment_choice import (
+    SEGMENT_DURATIONS,
+    find_segment_duration,
+    is_divisible,
+    leave_out_jumps,
+    loses_orientation,
+)
 from bench.diagnosis.pipeline.simulated_runs import DiagnosisContext, SimulatedRuns
 from bench.diagnosis.pipeline.solver_option_choice import SolverOptionChoice
 from bench.diagnosis.pipeline.time_step_choice import TimeStepChoice
 from bench.diagnosis.pipeline.verdict_builder import build_verdict
 from bench.diagnosis.verdict import Cause
-from sims.core.simulator import InputError
-
-
-class DivergingSimulationError(InputError):
-    """Error if no simulation follows the runs, at any starting point of the base fit.
-
-    Attributes:
-        longest_segment: maximum duration in seconds of segments that a simulation may follow.
-    """
-
-    def __init__(self, message: str, longest_segment: float = np.inf) -> None:
-        super().__init__(message)
-        self.longest_segment = longest_segment
 
 
 class ExplanationAndDesign(NamedTuple):
@@ -104,7 +100,13 @@ def explain_and_design(
     # The simulators stay open within the block.
     with _diagnose(recording, options) as diagnosis:
         diagnosis.result.runs.context.search_control.begin_stage("designing the next recording")
-        design = _design_next_run(diagnosis.result, seconds, longest)
+        # The run distinguishes the first cause that has alternatives. If there is none, it narrows
+        # the parameters of the present model.
+        result = diagnosis.result
+        competing_models = result.list_models_with_alternatives()
+        design = design_next_run(
+            result.search, result.finding.model, competing_models, seconds, longest
+        )
         return ExplanationAndDesign(diagnosis.explanation, design)
 
 
@@ -145,9 +147,7 @@ def _diagnose(
         ):
             runs = prepare_runs(sources, context)
             # Whether a further attempt is possible: shorter segments that the user did not set.
-            may_divide = (
-                runs.contacts.is_divisible and options.pieces is None and bool(remaining_durations)
-            )
+            may_divide = is_divisible(runs) and options.pieces is None and bool(remaining_durations)
             try:
                 diagnosis = _diagnose_runs(runs, may_divide)
             except DivergingSimulationError as error:
@@ -217,7 +217,7 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
             return model
         if not runs.kind.has_model:
             return model.widen_ranges()
-        segment_duration = model.find_segment_duration() if may_divide else None
+        segment_duration = find_segment_duration(model) if may_divide else None
         if segment_duration is not None:
             raise DivergingSimulationError(
                 f"{runs.recording.path}: the simulation amplifies errors of the first state",
@@ -233,12 +233,12 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
     runs.context.search_control.begin_stage(STAGES["base_fit"])
     base = fit_base(runs)
     if not base.is_simulated:
-        raise _make_simulation_error(base, error_check)
+        raise make_simulation_error(base, error_check.errors)
     if runs.contacts.is_on_ground:
         predictable_runs = leave_out_jumps(base.runs, base.fit.fit.simulated)
         if predictable_runs is not base.runs:
             base = fit_base(predictable_runs)
-    if may_divide and base.loses_orientation():
+    if may_divide and loses_orientation(base):
         raise DivergingSimulationError(
             f"{runs.recording.path}: the simulation loses the orientation"
         )
@@ -255,26 +255,6 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
     return _Diagnosis(_build_explanation(result, numerics_causes), result)
 
 
-def _make_simulation_error(base: BaseModel, error_check: RecordingErrorCheck) -> InputError:
-    """Return the error that explains why nothing could be simulated.
-
-    Args:
-        base: base model whose fit failed.
-        error_check: check for wrong units and signs, which may have found the reason.
-    """
-    path = base.runs.recording.path
-    if error_check.errors:
-        return InputError(f"{path}: {error_check.errors[0].says}")
-    if base.runs.context.search_control.is_over():
-        return InputError(
-            f"{path}: the search was stopped before the first fit of the recording was finished"
-        )
-    return DivergingSimulationError(
-        f"{path}: the simulation fails at every starting point of the fit; "
-        "check constants, units, inputs and initial states"
-    )
-
-
 def _build_explanation(result: SearchResult, numerics_causes: Sequence[Cause]) -> Explanation:
     """Build the verdict, the report data and the extended simulator.
 
@@ -288,19 +268,3 @@ def _build_explanation(result: SearchResult, numerics_causes: Sequence[Cause]) -
     notes = *unusual_values, *runs.context.notes
     report_data = build_report_data(result, verdict, notes)
     return Explanation(verdict, report_data, build_extended_simulator(result))
-
-
-def _design_next_run(result: SearchResult, seconds: float, longest: float) -> NextRunDesign | None:
-    """Design the next recording.
-
-    The run distinguishes the first cause that has alternatives. If there is none, it narrows the
-    parameters of the present model.
-
-    Args:
-        result: result of the search.
-        seconds: Duration of the run in seconds.
-        longest: Maximum duration in seconds, if `seconds` do not suffice.
-    """
-    competing_models = result.list_competing_models()
-    model = result.finding.model
-    return design_next_run(result.search, model, competing_models, seconds, longest)

@@ -1,4 +1,4 @@
-"""Extended model files of a robot, and the lines that differ from its model file."""
+"""Extended model files of a robot, with the fitted causes that a model file may contain."""
 
 from __future__ import annotations
 

@@ -51,7 +51,6 @@ from sims.recording.recording import Recording
 from sims.system_simulator import SystemSimulator
 
 IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
-
 MAX_IDENTIFIABLE_WIDTH, MAX_WEAK_WIDTH = 0.1, 1.0
 """Maximum width of a 95 % interval, as a fraction of a parameter's range, for identifiable and for
 weak parameters.
@@ -66,6 +65,8 @@ CANDIDATES_PER_BLOCK = 256
 """Number of candidates that are projected together, which limits the memory."""
 MAX_NAMED_CONFOUNDERS = 4
 """Maximum number of confounded parameters that are reported for one parameter."""
+MAX_REFITS = 4
+"""Maximum number of refits with more frozen numbers; the last one freezes all that remain."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,54 @@ class ParameterIdentifiability:
     mixed: tuple[tuple[str, float], ...]
 
 
+def check_identifiability(
+    source: str | Path | Recording,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+) -> tuple[ParameterIdentifiability, ...]:
+    """Assess which free numbers and which causes a recording can identify.
+
+    The base model is fitted first. The derivatives of the runs at the fit then show what the
+    recording can determine; white noise is assumed, so no correlation is estimated.
+
+    Args:
+        source: Recording, or the path of its table.
+        system: Name of the system to use instead of the one in the description.
+        model: Model file of a robot to use instead of the one in the description.
+        free: Numbers of a robot's model file, or constants of a system, that are estimated.
+
+    Returns:
+        Identifiability of each free number, then of each cause.
+
+    Raises:
+        InputError: The recording cannot be read, or its simulator takes no effects.
+    """
+    recording, kind = load_recording(source, system, model, free)
+    if not issubclass(kind, SystemSimulator):
+        raise InputError(f"{recording.path}: simulator {recording.system} takes no effects")
+    recording, _ = leave_out_settling(recording, kind)
+    recording, _ = segment_recording(recording, kind)
+    engine = kind.default_engine if kind.own_engine else "batch"
+    # The freed numbers of a robot are parameters of `kind` already.
+    constants = () if kind.has_model else tuple(free)
+    with closing(ForkedWorkerPool(1)) as worker_pool:
+        evaluator = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
+        evaluator.worker_pool = worker_pool
+        worker_pool.register(evaluator)
+        noise = NoiseModel.make_white(compute_noise_floor(evaluator, recording).sigma)
+        base = fit_base_model(evaluator, noise)
+        if not np.isfinite(base.fit.cost):
+            raise InputError(
+                f"{recording.path}: the simulation fails at every starting point of the fit; "
+                "check constants, units, inputs and initial states"
+            )
+        fit_with_derivatives = compute_central_jacobian(evaluator, base.fit, noise)
+        numbers = assess_identifiability(evaluator, noise, fit_with_derivatives)
+        evaluator.close()
+    return numbers
+
+
 def assess_identifiability(
     evaluator: RunEvaluator,
     noise: NoiseModel,
@@ -118,6 +167,34 @@ def assess_identifiability(
         ]
         direction_set = compute_directions(evaluator, fit, names)
     return _IdentifiabilityAssessment(evaluator, noise, fit, direction_set).numbers()
+
+
+def assess_identifiability_after_search(
+    search: EffectSearch,
+) -> tuple[ParameterIdentifiability, ...]:
+    """Assess identifiability from the responses of the runs to effects (directions).
+
+    The search has computed them about the base model, on their own or together with scores. If it
+    has not, the result is empty. This is the last step that uses the search, so its memory is
+    released first.
+
+    Args:
+        search: Finished search.
+
+    Returns:
+        Free parameters first, then causes, those with the narrowest intervals first.
+    """
+    search.release_memory()
+    directions = search.get_known_directions()
+    if directions is None:
+        # Scans are scores with their directions, by the effects of the model; the base model has no
+        # effects. That of an earlier fit is used if a better fit has replaced it without a scan.
+        key: frozenset[str] = frozenset()
+        scan = search.cached_scans.get(key) or search.superseded_scans.get(key)
+        if scan is None:
+            return ()
+        directions = scan.fit, scan.directions
+    return assess_identifiability(search.evaluator, search.noise, *directions)
 
 
 class _Direction(NamedTuple):
@@ -384,10 +461,6 @@ def _share_of_range(number: ParameterIdentifiability) -> float:
         return float(np.nan_to_num(number.half) / width) if width > 0 else 0.0
 
 
-MAX_REFITS = 4
-"""Maximum number of refits with more frozen numbers; the last one freezes all remaining ones."""
-
-
 def freeze_unidentified_parameters(
     evaluator: RunEvaluator,
     noise: NoiseModel,
@@ -426,76 +499,3 @@ def freeze_unidentified_parameters(
             base, unidentified_parameters=base.unidentified_parameters | frozenset(frozen_indices)
         ).refit_at_nominal(evaluator, noise, frozen_indices)
     return base
-
-
-def check_identifiability(
-    source: str | Path | Recording,
-    system: str | None = None,
-    model: str | Path | None = None,
-    free: Sequence[str] = (),
-) -> tuple[ParameterIdentifiability, ...]:
-    """Assess which free numbers and which causes a recording can identify.
-
-    The base model is fitted first. The derivatives of the runs at the fit then show what the
-    recording can determine; white noise is assumed, so no correlation is estimated.
-
-    Args:
-        source: Recording, or the path of its table.
-        system: Name of the system to use instead of the one in the description.
-        model: Model file of a robot to use instead of the one in the description.
-        free: Numbers of a robot's model file, or constants of a system, that are estimated.
-
-    Returns:
-        Identifiability of each free number, then of each cause.
-
-    Raises:
-        InputError: The recording cannot be read, or its simulator takes no effects.
-    """
-    recording, kind = load_recording(source, system, model, free)
-    if not issubclass(kind, SystemSimulator):
-        raise InputError(f"{recording.path}: simulator {recording.system} takes no effects")
-    recording, _ = leave_out_settling(recording, kind)
-    recording, _ = segment_recording(recording, kind)
-    engine = kind.default_engine if kind.own_engine else "batch"
-    # The freed numbers of a robot are parameters of `kind` already.
-    constants = () if kind.has_model else tuple(free)
-    with closing(ForkedWorkerPool(1)) as worker_pool:
-        evaluator = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
-        evaluator.worker_pool = worker_pool
-        worker_pool.register(evaluator)
-        noise = NoiseModel.make_white(compute_noise_floor(evaluator, recording).sigma)
-        base = fit_base_model(evaluator, noise)
-        if not np.isfinite(base.fit.cost):
-            raise InputError(
-                f"{recording.path}: the simulation fails at every starting point of the fit; "
-                "check constants, units, inputs and initial states"
-            )
-        fit_with_derivatives = compute_central_jacobian(evaluator, base.fit, noise)
-        numbers = assess_identifiability(evaluator, noise, fit_with_derivatives)
-        evaluator.close()
-    return numbers
-
-
-def assess_identifiability_after_search(
-    search: EffectSearch,
-) -> tuple[ParameterIdentifiability, ...]:
-    """Assess identifiability from the responses of the runs to effects (directions).
-
-    The search has computed them about the base model, on their own or together with scores. If it
-    has not, the result is empty. This is the last step that uses the search, so its memory is
-    released first.
-
-    Args:
-        search: the finished search.
-    """
-    search.release_memory()
-    directions = search.get_known_directions()
-    if directions is None:
-        # Scans are scores with their directions, by the effects of the model; the base model has no
-        # effects. That of an earlier fit is used if a better fit has replaced it without a scan.
-        key: frozenset[str] = frozenset()
-        scan = search.cached_scans.get(key) or search.superseded_scans.get(key)
-        if scan is None:
-            return ()
-        directions = scan.fit, scan.directions
-    return assess_identifiability(search.evaluator, search.noise, *directions)

@@ -1,9 +1,10 @@
-"""Explain many recordings separately, and put their causes into tables.
+"""Explain many recordings separately, and write the table and the summary page of their causes.
 
-The calls may run in any order, locally or on a cluster. A log that cannot be explained becomes a
-row with the reason and does not affect the others.
-
-Page of many logs that are explained separately: the values of the template `html`.
+1. Explain each log (`explain_batch`). The calls may run in any order, locally or on a cluster. A
+   log that cannot be explained becomes a row with the reason and does not affect the others.
+2. Write all causes with their numbers as logs.csv (`format_log_table`).
+3. Write the page (`write_summary_page`): the verdicts and causes of all logs, each number of the
+   causes over the logs, and the errors on held-out runs.
 """
 
 from __future__ import annotations
@@ -46,13 +47,37 @@ from sims.core.simulator import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
 LOGS_TABLE_FILE = "logs.csv"
-"""File name of the table, which has one row for each number of each cause of each log."""
+"""File name of the table of causes, which has one row for each number of each cause of each log."""
 LOG_COLUMNS = (
     "log", "verdict", "cause", "alternatives", "coefficient", "value", "low", "high", "unit",
     "gap_closed", "seconds", "error",
 )  # fmt: skip
+"""Columns of the table of causes."""
+BATCH_STATE_FILE = "logs.json"
+"""File name of the batch state, which is rewritten whenever a log is done."""
+REPORT_FILE = "report.html"
+"""File name of a log's report in its folder, and of the summary page of all logs."""
+_TEMPLATE = Path(__file__).with_name("many_logs.html")
+"""Template of the page."""
+_TEXT_COLUMNS = ("log", "verdict", "causes", "error", "report")
+_NUMERIC_COLUMNS = ("gap_closed", "low", "high", "before", "after", "seconds")
+"""Text and numeric columns of the table of logs on the page, after the number of the log."""
+MAX_NAMED = 6
+"""Maximum number of causes, and of failed logs, that are listed before the tables."""
+MAX_COEFFICIENT_NAME_CHARACTERS = 80
+"""Maximum number of characters of a coefficient's name that are shown."""
+MAX_PANELS = 4
+"""Maximum number of numbers that the printed figure shows."""
+_MAX_AXIS_CHARACTERS = 120
+"""Maximum total number of characters of log names on an axis; with more, the logs are numbered."""
+_MAX_TITLE_CHARACTERS = 34
+"""Maximum line length of a panel's title, in characters."""
+_LOG_HEIGHT_INCHES = 0.3
+"""Height of a log in the printed figures, in inches."""
+_BEFORE_STYLE = style.make_mark_style(style.VERMILION, (), "s")
+_AFTER_STYLE = style.make_mark_style(style.BLUE, (), "o")
+"""Marks of the errors before and after the causes are added; values of causes have the latter."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +86,7 @@ class LogResult(Document):
 
     Attributes:
         log: Name of the log.
-        digest: Digest of the log's files and settings, see `Log`.
+        digest: Digest of the log's files and settings, see `BatchLog`.
         verdict: Verdict in one word; empty if the log could not be explained.
         causes: Causes as in verdict.json.
         gap_closed: Share of the held-out gap that is closed; None without held-out runs.
@@ -76,195 +101,6 @@ class LogResult(Document):
     gap_closed: float | None = None
     seconds: float | None = None
     error: str = ""
-
-
-def format_cause(cause: Mapping[str, Any]) -> str:
-    """Format a cause with its alternatives: ``friction.coulomb or joint.backlash``."""
-    return " or ".join([cause["effect"], *cause["alternatives"]])
-
-
-def format_log_table(rows: Sequence[LogResult]) -> str:
-    """Format the table of all logs as CSV, with one row for each number of each cause.
-
-    A log without causes has one row, in which the cells of the cause are empty.
-
-    Args:
-        rows: result of each log, with its causes as in verdict.json.
-    """
-    lines: list[tuple[object, ...]] = []
-    for row in rows:
-        cause_cells: list[tuple[object, ...]] = []
-        for cause in row.causes:
-            alternatives = " or ".join(cause["alternatives"])
-            for coefficient, number in cause["coefficients"].items():
-                estimate = [number[key] for key in ("value", "low", "high", "unit")]
-                cause_cells.append((cause["effect"], alternatives, coefficient, *estimate))
-        common_cells = row.gap_closed, row.seconds, row.error
-        no_cause = ("",) * 7
-        lines += [
-            (row.log, row.verdict, *cells, *common_cells) for cells in cause_cells or [no_cause]
-        ]
-    return format_csv(LOG_COLUMNS, lines)
-
-
-class CommonCause(NamedTuple):
-    """Cause over all logs: its effects, the names of its logs, and the ranges of its numbers."""
-
-    name: str
-    logs: list[str]
-    ranges: str
-
-
-def list_common_causes(rows: Sequence[LogResult]) -> list[CommonCause]:
-    """List the causes over all logs, the most common first.
-
-    Alternatives that the data of a log do not distinguish count as one cause.
-
-    Args:
-        rows: result of each log, with its causes as in verdict.json.
-    """
-    logs_by_cause: dict[str, list[str]] = {}
-    numbers_by_cause: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
-    for row in rows:
-        for cause in row.causes:
-            name = format_cause(cause)
-            logs_by_cause.setdefault(name, []).append(row.log)
-            for coefficient, number in cause["coefficients"].items():
-                by_coefficient = numbers_by_cause.setdefault(name, {})
-                by_coefficient.setdefault(coefficient, []).append(number)
-    causes = [
-        CommonCause(name, logs, _format_ranges(numbers_by_cause.get(name, {})))
-        for name, logs in logs_by_cause.items()
-    ]
-    return sorted(causes, key=lambda cause: -len(cause.logs))
-
-
-def _format_ranges(numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Format the range of each coefficient over the logs, such as ``0.3 to 0.7 N``."""
-    parts = []
-    for name, estimates in numbers.items():
-        values = [estimate["value"] for estimate in estimates]
-        # Ends that are printed alike are printed once.
-        ends = dict.fromkeys(format_number(end, 4) for end in (min(values), max(values)))
-        label = "" if name == "coefficient" else f"{place_of(name)} "
-        parts.append(label + append_unit(" to ".join(ends), estimates[0]["unit"]))
-    return joined(parts)
-
-
-def summarise_causes(rows: Sequence[LogResult]) -> list[str]:
-    """Summarise how often each cause was found, and the range of its numbers, as lines."""
-    return [
-        f"{cause.name}: in {len(cause.logs)} of {len(rows)} logs, {cause.ranges}"
-        for cause in list_common_causes(rows)
-    ]
-
-
-REPORT_FILE = "report.html"
-"""File name of a log's report in its folder, and of the summary page of all logs."""
-LONGEST_NAME = 80
-"""Maximum number of characters of a number's name that are shown."""
-_TEXTS = ("log", "verdict", "causes", "error", "report")
-_MEASURED = ("gap_closed", "low", "high", "before", "after", "seconds")
-"""Numeric columns of the table of logs."""
-
-
-def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> pd.DataFrame:
-    """Build a table with one row per log: its causes, its report and the share of the gap closed.
-
-    `before` and `after` are the errors on held-out runs of the base and the extended model, as
-    multiples of the noise floor; they are NaN if a log was not explained.
-
-    Args:
-        rows: Result of each log.
-        folders: Folder of each log's explanation, by log.
-    """
-    lines = []
-    for log_number, row in enumerate(rows, start=1):
-        folder = folders[row.log]
-        errors = _read_held_out_errors(folder) if not row.error else {}
-        report = "" if row.error else quote(f"{folder.name}/{REPORT_FILE}")
-        lines.append({
-            "number": log_number, "log": row.log, "verdict": row.verdict or "not explained",
-            "causes": "; ".join(format_cause(cause) for cause in row.causes),
-            "gap_closed": row.gap_closed,
-            "low": errors.get("low"), "high": errors.get("high"),
-            "before": _convert_to_noise_floors(errors, "rmse_base"),
-            "after": _convert_to_noise_floors(errors, "rmse_extended"),
-            "seconds": row.seconds, "error": row.error, "report": report,
-        })  # fmt: skip
-    frame = pd.DataFrame(lines, columns=["number", *_TEXTS, *_MEASURED])
-    return frame.astype(dict.fromkeys(_MEASURED, float))
-
-
-def read_log_table(rows: Sequence[LogResult]) -> pd.DataFrame:
-    """Read the text of logs.csv as a table; names that look like numbers stay text."""
-    frame = pd.read_csv(StringIO(format_log_table(rows)), dtype=str, keep_default_na=False)
-    numeric = ["value", "low", "high", "gap_closed", "seconds"]
-    frame[numeric] = frame[numeric].apply(pd.to_numeric).astype(float)
-    return frame
-
-
-def _read_held_out_errors(folder: Path) -> dict[str, float]:
-    """Read the held-out errors from a log's verdict.json; empty if it cannot be read."""
-    try:
-        held_out = json.loads((folder / "verdict.json").read_text(encoding="utf-8"))["heldout"]
-        return {key: value for key, value in held_out.items() if isinstance(value, (int, float))}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {}
-
-
-def _convert_to_noise_floors(errors: Mapping[str, float], key: str) -> float | None:
-    """Return a held-out error as a multiple of the noise floor; None if one of them is unknown.
-
-    Args:
-        errors: held-out errors in the unit of the channel, and ``noise_floor``, by name.
-        key: name of the error.
-    """
-    value, floor = errors.get(key), errors.get("noise_floor")
-    return value / floor if value is not None and floor else None
-
-
-def place_of(name: str) -> str:
-    """Format the place of a coefficient: ``at elbow`` for ``coefficient@elbow``."""
-    coefficient, separator, place = name.partition("@")
-    return f"at {place}" if separator and coefficient == "coefficient" else name
-
-
-def build_number_table(rows: Sequence[LogResult]) -> pd.DataFrame:
-    """Build a table with one row per number of each cause, those of the commonest cause first.
-
-    A number is a fitted coefficient of a cause, with its 95 % interval `low` to `high`. The column
-    `what` names cause, coefficient and unit; numbers with equal text are shown together.
-
-    Args:
-        rows: results of the diagnoses, one for each log.
-    """
-    lines = []
-    for log_number, row in enumerate(rows, start=1):
-        for cause in row.causes:
-            for name, estimate in cause["coefficients"].items():
-                label = format_label(place_of(name), estimate["unit"], LONGEST_NAME)
-                lines.append(
-                    {
-                        "number": log_number,
-                        "log": row.log,
-                        "cause": format_cause(cause),
-                        "name": name,
-                        "what": f"{format_cause(cause)}: {label}",
-                        **estimate,
-                    }
-                )
-    columns = ["number", "log", "cause", "name", "what", "value", "low", "high", "unit"]
-    frame = pd.DataFrame(lines, columns=columns)
-    frame = frame.astype(dict.fromkeys(["value", "low", "high"], float))
-    # The number that most logs have comes first.
-    frequency = frame["what"].map(frame["what"].value_counts())
-    order = frequency.sort_values(ascending=False, kind="stable").index
-    return frame.loc[order].reset_index(drop=True)
-
-
-BATCH_STATE_FILE = "logs.json"
-"""File name of the batch state, which is rewritten whenever a log is done."""
 
 
 @dataclass(frozen=True)
@@ -445,19 +281,99 @@ def _write_results(out: Path, rows: Sequence[LogResult]) -> None:
         raise InputError(f"{out}: cannot be written ({error.strerror})") from None
 
 
-_TEMPLATE = Path(__file__).with_name("many_logs.html")
-_NAMED_LETTERS = 120
-"""Maximum total number of characters of log names on an axis; with more, the logs are numbered."""
-MAX_NAMED = 6
-"""Maximum number of causes, and of failed logs, that are listed before the tables."""
-MAX_PANELS = 4
-"""Maximum number of numbers that the printed figure shows."""
-_TITLE_LINE = 34
-"""Maximum line length of a panel's title, in characters."""
-_NAME_HEIGHT = 0.3
-"""Height of a log in the printed figures, in inches."""
-_BEFORE = style.make_mark_style(style.VERMILION, (), "s")
-_AFTER = style.make_mark_style(style.BLUE, (), "o")
+def format_log_table(rows: Sequence[LogResult]) -> str:
+    """Format the table of all logs as CSV, with one row for each number of each cause.
+
+    A log without causes has one row, in which the cells of the cause are empty.
+
+    Args:
+        rows: result of each log, with its causes as in verdict.json.
+    """
+    lines: list[tuple[object, ...]] = []
+    for row in rows:
+        cause_cells: list[tuple[object, ...]] = []
+        for cause in row.causes:
+            alternatives = " or ".join(cause["alternatives"])
+            for coefficient, number in cause["coefficients"].items():
+                estimate = [number[key] for key in ("value", "low", "high", "unit")]
+                cause_cells.append((cause["effect"], alternatives, coefficient, *estimate))
+        common_cells = row.gap_closed, row.seconds, row.error
+        no_cause = ("",) * 7
+        lines += [
+            (row.log, row.verdict, *cells, *common_cells) for cells in cause_cells or [no_cause]
+        ]
+    return format_csv(LOG_COLUMNS, lines)
+
+
+def read_log_table(rows: Sequence[LogResult]) -> pd.DataFrame:
+    """Read the text of logs.csv as a table; names that look like numbers stay text."""
+    frame = pd.read_csv(StringIO(format_log_table(rows)), dtype=str, keep_default_na=False)
+    numeric = ["value", "low", "high", "gap_closed", "seconds"]
+    frame[numeric] = frame[numeric].apply(pd.to_numeric).astype(float)
+    return frame
+
+
+class CommonCause(NamedTuple):
+    """Cause over all logs: its effects, the names of its logs, and the ranges of its numbers."""
+
+    name: str
+    logs: list[str]
+    ranges: str
+
+
+def list_common_causes(rows: Sequence[LogResult]) -> list[CommonCause]:
+    """List the causes over all logs, the most common first.
+
+    Alternatives that the data of a log do not distinguish count as one cause.
+
+    Args:
+        rows: result of each log, with its causes as in verdict.json.
+    """
+    logs_by_cause: dict[str, list[str]] = {}
+    numbers_by_cause: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
+    for row in rows:
+        for cause in row.causes:
+            name = format_cause(cause)
+            logs_by_cause.setdefault(name, []).append(row.log)
+            for coefficient, number in cause["coefficients"].items():
+                by_coefficient = numbers_by_cause.setdefault(name, {})
+                by_coefficient.setdefault(coefficient, []).append(number)
+    causes = [
+        CommonCause(name, logs, _format_ranges(numbers_by_cause.get(name, {})))
+        for name, logs in logs_by_cause.items()
+    ]
+    return sorted(causes, key=lambda cause: -len(cause.logs))
+
+
+def _format_ranges(numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Format the range of each coefficient over the logs, such as ``0.3 to 0.7 N``."""
+    parts = []
+    for name, estimates in numbers.items():
+        values = [estimate["value"] for estimate in estimates]
+        # Ends that are printed alike are printed once.
+        ends = dict.fromkeys(format_number(end, 4) for end in (min(values), max(values)))
+        label = "" if name == "coefficient" else f"{_format_coefficient_place(name)} "
+        parts.append(label + append_unit(" to ".join(ends), estimates[0]["unit"]))
+    return joined(parts)
+
+
+def summarise_causes(rows: Sequence[LogResult]) -> list[str]:
+    """Summarise how often each cause was found, and the range of its numbers, as lines."""
+    return [
+        f"{cause.name}: in {len(cause.logs)} of {len(rows)} logs, {cause.ranges}"
+        for cause in list_common_causes(rows)
+    ]
+
+
+def format_cause(cause: Mapping[str, Any]) -> str:
+    """Format a cause with its alternatives: ``friction.coulomb or joint.backlash``."""
+    return " or ".join([cause["effect"], *cause["alternatives"]])
+
+
+def _format_coefficient_place(name: str) -> str:
+    """Format the place of a coefficient: ``at elbow`` for ``coefficient@elbow``."""
+    coefficient, separator, place = name.partition("@")
+    return f"at {place}" if separator and coefficient == "coefficient" else name
 
 
 @dataclass(frozen=True)
@@ -552,6 +468,91 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
     )
 
 
+def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> pd.DataFrame:
+    """Build a table with one row per log: its causes, its report and the share of the gap closed.
+
+    `before` and `after` are the errors on held-out runs of the base and the extended model, as
+    multiples of the noise floor; they are NaN if a log was not explained.
+
+    Args:
+        rows: Result of each log.
+        folders: Folder of each log's explanation, by log.
+    """
+    lines = []
+    for log_number, row in enumerate(rows, start=1):
+        folder = folders[row.log]
+        errors = _read_held_out_errors(folder) if not row.error else {}
+        report = "" if row.error else quote(f"{folder.name}/{REPORT_FILE}")
+        lines.append({
+            "number": log_number, "log": row.log, "verdict": row.verdict or "not explained",
+            "causes": "; ".join(format_cause(cause) for cause in row.causes),
+            "gap_closed": row.gap_closed,
+            "low": errors.get("low"), "high": errors.get("high"),
+            "before": _convert_to_noise_floors(errors, "rmse_base"),
+            "after": _convert_to_noise_floors(errors, "rmse_extended"),
+            "seconds": row.seconds, "error": row.error, "report": report,
+        })  # fmt: skip
+    frame = pd.DataFrame(lines, columns=["number", *_TEXT_COLUMNS, *_NUMERIC_COLUMNS])
+    return frame.astype(dict.fromkeys(_NUMERIC_COLUMNS, float))
+
+
+def _read_held_out_errors(folder: Path) -> dict[str, float]:
+    """Read the held-out errors from a log's verdict.json; empty if it cannot be read."""
+    try:
+        held_out = json.loads((folder / "verdict.json").read_text(encoding="utf-8"))["heldout"]
+        return {key: value for key, value in held_out.items() if isinstance(value, (int, float))}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def _convert_to_noise_floors(errors: Mapping[str, float], key: str) -> float | None:
+    """Return a held-out error as a multiple of the noise floor; None if one of them is unknown.
+
+    Args:
+        errors: held-out errors in the unit of the channel, and ``noise_floor``, by name.
+        key: name of the error.
+    """
+    value, floor = errors.get(key), errors.get("noise_floor")
+    return value / floor if value is not None and floor else None
+
+
+def build_number_table(rows: Sequence[LogResult]) -> pd.DataFrame:
+    """Build a table with one row per number of each cause, those of the commonest cause first.
+
+    A number is a fitted coefficient of a cause, with its 95 % interval `low` to `high`. The column
+    `what` names cause, coefficient and unit; numbers with equal text are shown together.
+
+    Args:
+        rows: results of the diagnoses, one for each log.
+    """
+    lines = []
+    for log_number, row in enumerate(rows, start=1):
+        for cause in row.causes:
+            for name, estimate in cause["coefficients"].items():
+                label = format_label(
+                    _format_coefficient_place(name),
+                    estimate["unit"],
+                    MAX_COEFFICIENT_NAME_CHARACTERS,
+                )
+                lines.append(
+                    {
+                        "number": log_number,
+                        "log": row.log,
+                        "cause": format_cause(cause),
+                        "name": name,
+                        "what": f"{format_cause(cause)}: {label}",
+                        **estimate,
+                    }
+                )
+    columns = ["number", "log", "cause", "name", "what", "value", "low", "high", "unit"]
+    frame = pd.DataFrame(lines, columns=columns)
+    frame = frame.astype(dict.fromkeys(["value", "low", "high"], float))
+    # The number that most logs have comes first.
+    frequency = frame["what"].map(frame["what"].value_counts())
+    order = frequency.sort_values(ascending=False, kind="stable").index
+    return frame.loc[order].reset_index(drop=True)
+
+
 class SummaryCharts(NamedTuple):
     """Charts of the page.
 
@@ -593,7 +594,7 @@ def make_summary_charts(logs: pd.DataFrame, numbers: pd.DataFrame) -> SummaryCha
 def _make_log_axis(logs: pd.DataFrame) -> Axis:
     """Make the axis of the logs: with their names if they fit, otherwise with their numbers."""
     names = [str(name) for name in logs["log"]]
-    if len(names) * max(map(len, names), default=0) <= _NAMED_LETTERS:
+    if len(names) * max(map(len, names), default=0) <= _MAX_AXIS_CHARACTERS:
         return Axis("log", names=tuple(names))
     return Axis("log, by its number", scales=("linear",), ends=(0.5, len(logs) + 0.5))
 
@@ -615,7 +616,7 @@ def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
             Series(
                 "each log",
                 "value",
-                _AFTER,
+                _AFTER_STYLE,
                 where={"what": label_with_cause},
                 low="low",
                 high="high",
@@ -650,8 +651,8 @@ def _make_held_out_panels(logs: pd.DataFrame, across: Axis) -> list[Panel]:
     if not log_count:
         return []
     series = (
-        Series("before: tuned simulation", "before", _BEFORE, draw="points"),
-        Series("after: with the causes found", "after", _AFTER, draw="points"),
+        Series("before: tuned simulation", "before", _BEFORE_STYLE, draw="points"),
+        Series("after: with the causes found", "after", _AFTER_STYLE, draw="points"),
     )
     # `holds` keeps the noise floor, 1, within the range of the axis.
     error_axis = Axis("error on held-out runs [noise floors]", "log", holds=(1.0,))
@@ -673,8 +674,10 @@ def draw_summary_figure(
     """
     # Height in inches: title and axis, and a line for each log that is named.
     log_names = panels[0].across.names
-    height = 1.2 + _NAME_HEIGHT * len(log_names) if log_names else 4.0
+    height = 1.2 + _LOG_HEIGHT_INCHES * len(log_names) if log_names else 4.0
     figure, axes = draw_chart(panels, tables, size=(3.4, height), horizontal=True)
     for axis, panel in zip(axes, panels, strict=True):
-        axis.set_title(break_name(panel.title, _TITLE_LINE), fontsize=8.5, parse_math=False)
+        axis.set_title(
+            break_name(panel.title, _MAX_TITLE_CHARACTERS), fontsize=8.5, parse_math=False
+        )
     return finish_chart(figure, axes[0], caption=caption, legend="outside upper center")

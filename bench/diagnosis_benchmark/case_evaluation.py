@@ -1,7 +1,7 @@
 """Evaluation of one case with several diagnosers, each in its own process; runs in a worker.
 
-The worker draws the case and writes its recording. The process of a diagnoser receives the texts of
-the recording's files through a pipe, and nothing else.
+The worker draws the case and renders its recording. The process of a diagnoser
+(`diagnoser_process`) receives the texts of the recording's files through a pipe, and nothing else.
 """
 
 from __future__ import annotations
@@ -13,9 +13,7 @@ from time import perf_counter
 from typing import Any
 
 from bench.benchmark.isolation.process_errors import RunEndedError
-from bench.benchmark.isolation.tuner_processes import (
-    TunerSpec,
-)
+from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.runner.retry_after_kill import retry_if_killed
 from bench.benchmark.runner.trained_weights import read_weights
 from bench.core.random_streams import make_seed_words
@@ -101,6 +99,43 @@ def evaluate_case(
     return {"question": case_spec.name, "item": case.to_document(), "rows": rows}
 
 
+def make_failed_answers(
+    question: CaseSpec, labels: Sequence[str], error: BaseException
+) -> dict[str, Any]:
+    """Make failed answers for a case whose worker died or exceeded its time limit.
+
+    Args:
+        question: specification of a case: system, hidden cause, size and seed.
+        labels: labels of the diagnosers.
+        error: error of the worker.
+
+    Returns:
+        Document as `evaluate_case` returns it: name of the case (``question``), the case
+        (``item``), of which only the name is known, and one row per diagnoser.
+
+    Raises:
+        InputError: `error` is one: a wrong input stops the study.
+    """
+    if isinstance(error, InputError):
+        raise error
+    status = "timeout" if isinstance(error, TimeoutError) else "crashed"
+    rows = [
+        {
+            "question": question.name,
+            "diagnoser": label,
+            "status": status,
+            "reason": str(error),
+            "answer": None,
+            "simulations": 0,
+            "processor_seconds": None,
+            "seconds": None,
+            "trusted": False,
+        }
+        for label in labels
+    ]
+    return {"question": question.name, "item": {"name": question.name}, "rows": rows}
+
+
 def _ask_diagnoser(
     diagnoser: EvaluatedDiagnoser,
     request: dict[str, Any],
@@ -156,40 +191,3 @@ def _format_failure_reason(text: str) -> str:
     if "sims.core.simulation_counter.SimulationBudgetExceededError" in text:
         return f"{BUDGET_EXCEEDED_REASON}\n{text}"
     return text
-
-
-def make_failed_answers(
-    question: CaseSpec, labels: Sequence[str], error: BaseException
-) -> dict[str, Any]:
-    """Make failed answers for a case whose worker died or exceeded its time limit.
-
-    Args:
-        question: specification of a case: system, hidden cause, size and seed.
-        labels: labels of the diagnosers.
-        error: error of the worker.
-
-    Returns:
-        Document as `evaluate_case` returns it: name of the case (``question``), the case
-        (``item``), of which only the name is known, and one row per diagnoser.
-
-    Raises:
-        InputError: `error` is one: a wrong input stops the study.
-    """
-    if isinstance(error, InputError):
-        raise error
-    status = "timeout" if isinstance(error, TimeoutError) else "crashed"
-    rows = [
-        {
-            "question": question.name,
-            "diagnoser": label,
-            "status": status,
-            "reason": str(error),
-            "answer": None,
-            "simulations": 0,
-            "processor_seconds": None,
-            "seconds": None,
-            "trusted": False,
-        }
-        for label in labels
-    ]
-    return {"question": question.name, "item": {"name": question.name}, "rows": rows}

@@ -105,13 +105,6 @@ def list_unmodelled_causes(system: str) -> list[str]:
     )
 
 
-def find_equivalent_effects(case: BenchmarkCase, effect: str) -> frozenset[str]:
-    """Return an effect and all effects that are equivalent to it in the recording of a case."""
-    if case.system in machines.MACHINE_NAMES:
-        return machines.find_equivalent_causes(case.system, effect)
-    return case_sampling.find_equivalent_effects(case.system, case.driven, effect)
-
-
 def render_recording(case: BenchmarkCase) -> RecordingFiles:
     """Render the recording of a case as texts, for the process of a diagnoser.
 

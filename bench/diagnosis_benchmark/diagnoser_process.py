@@ -1,8 +1,12 @@
-"""Server side of an isolated diagnoser: write the recording, call the diagnoser, send its answer.
+"""Run a diagnoser on a case, in an isolated process or, if it is trusted, in this one.
 
-The harness cannot trust anything from this process once the code of a plugin has run in it. The
-simulations are counted in this process, so a malicious plugin could change their number. It cannot
-obtain the true causes, because no process of a diagnoser ever contains them.
+`diagnose_isolated` starts the isolated process from the harness, sends it the recording and
+validates its answer. `serve_requests` is the other end of the channel, in the isolated process: it
+writes the recording, calls the diagnoser and sends the answer.
+
+The harness cannot trust anything from the isolated process once the code of a plugin has run in it.
+The simulations are counted in that process, so a malicious plugin could change their number. It
+cannot obtain the true causes, because no process of a diagnoser ever contains them.
 """
 
 from __future__ import annotations
@@ -55,11 +59,11 @@ from sims.core.simulator import Array, InputError
 from sims.recording.recording import read_recording
 from sims.system_simulator import SystemSimulator
 
-_MAX_DOCUMENT_BYTES = 1 << 30
-"""Maximum size in bytes of a case document."""
-
 PRELOAD_MODULE = "bench.diagnosis_benchmark.preload"
 """Module that is preloaded in the fork server."""
+
+_MAX_DOCUMENT_BYTES = 1 << 30
+"""Maximum size of the document of a case, bytes."""
 
 _MAX_ANSWER_BYTES = 1 << 20
 """Maximum size of an answer, bytes."""
@@ -67,11 +71,160 @@ _MAX_ANSWER_BYTES = 1 << 20
 _MAX_REASON_LENGTH = 200
 """Maximum length of the reason why a diagnoser does not support a case, characters."""
 
+_USED_SIMULATIONS_KEY = "simulations"
+"""Name of the array with the number of simulations that a training used."""
+
+
+@dataclass(frozen=True)
+class AnswerLimits:
+    """Limits of one answer.
+
+    Attributes:
+        simulations: maximum number of simulations with simgap's simulators.
+        seconds: maximum elapsed time.
+        memory: maximum memory, MiB; 0 for no limit.
+    """
+
+    simulations: int
+    seconds: float
+    memory: int = 0
+
+
+def diagnose_isolated(
+    code: TunerSpec,
+    request: dict[str, Any],
+    trained_arrays: Mapping[str, Array],
+    limits: AnswerLimits,
+    hidden: tuple[str, ...],
+) -> dict[str, Any]:
+    """Run a diagnoser on a case in an isolated process and validate its answer.
+
+    The process ends after this answer, so that nothing passes from one case to the next. Messages
+    have a kind of `MessageKind`: WEIGHTS has the trained arrays, QUESTION the case, and ANSWER the
+    answer. The time limit begins with the case; starting the process and loading the arrays do not
+    count.
+
+    Args:
+        code: where the code of the diagnoser is.
+        request: request with the texts of the recording.
+        trained_arrays: trained arrays; empty if the diagnoser needs no training.
+        limits: limits of the answer.
+        hidden: folders that the diagnoser may not read.
+
+    Returns:
+        Answer, number of simulations, processor time and elapsed seconds; or the reason in
+        ``skipped`` if the diagnoser does not support the simulator.
+
+    Raises:
+        RunEndedError: the diagnoser failed.
+    """
+    # Only the recording of a robot has further files: its model file.
+    extra_modules = ("mujoco",) if request["beside"] else ()
+    child = start_diagnoser_process(code, limits.memory, hidden, extra_modules)
+    try:
+        if trained_arrays:
+            deadline = perf_counter() + START_TIMEOUT_SECONDS
+            child.send(MessageKind.WEIGHTS, *pack_arrays(trained_arrays), deadline=deadline)
+            child.receive(deadline=deadline)  # the process confirms that it has the arrays
+        started_at = perf_counter()
+        deadline = started_at + limits.seconds
+        child.send(MessageKind.QUESTION, json.dumps(request).encode(), deadline=deadline)
+        message = child.receive(_MAX_ANSWER_BYTES, deadline)
+        seconds = perf_counter() - started_at
+        try:
+            if message.kind != MessageKind.ANSWER:
+                raise ProtocolError("it gave no answer")
+            answer = _validate_answer(message.to_document(_MAX_ANSWER_BYTES), limits)
+        except (ProtocolError, InputError, KeyError, TypeError, ValueError) as error:
+            raise child.fail_with_protocol_error(f"{error}"[:500]) from None
+        return {**answer, "seconds": seconds}
+    finally:
+        child.end()
+
+
+def start_diagnoser_process(
+    code: TunerSpec, memory: int, hidden: tuple[str, ...], extra_modules: tuple[str, ...] = ()
+) -> IsolatedProcess:
+    """Start the isolated process of a diagnoser from the fork server, and wait until it is ready.
+
+    Args:
+        code: where the code of the diagnoser is.
+        memory: maximum memory, MiB; 0 for no limit.
+        hidden: folders that the process must not read.
+        extra_modules: further modules that the fork server loads first, such as MuJoCo for robots.
+
+    Returns:
+        The process; the caller ends it.
+    """
+    child = start_part_process(
+        code,
+        "bench.diagnosis_benchmark.diagnoser_process:serve_requests",
+        memory,
+        hidden,
+        # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
+        [PRELOAD_MODULE, *extra_modules],
+    )
+    try:
+        child.wait_until_ready()
+    except BaseException:
+        child.end()
+        raise
+    return child
+
+
+def _validate_answer(message: Any, limits: AnswerLimits) -> dict[str, Any]:
+    """Validate the message of an isolated diagnoser, which may be malicious.
+
+    Args:
+        message: document that the process of the diagnoser sent.
+        limits: limits of the answer, which the reported costs cannot exceed.
+
+    Returns:
+        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
+        diagnoser does not support the simulator.
+
+    Raises:
+        ProtocolError: the reported costs are impossible.
+    """
+    simulations, seconds = int(message["simulations"]), float(message["processor_seconds"])
+    # A billion seconds are 32 years; NaN is refused, too.
+    if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
+        raise ProtocolError("it reported an impossible number of simulations")
+    if skipped := str(message.get("skipped", ""))[:_MAX_REASON_LENGTH]:
+        empty_answer = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
+        return {**empty_answer, "skipped": skipped}
+    answer = Answer.of(message["answer"]).document()
+    return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
+
+
+def diagnose_in_process(
+    request: dict[str, Any], trained_arrays: Mapping[str, Array]
+) -> dict[str, Any]:
+    """Run a trusted diagnoser on a case in this process.
+
+    Args:
+        request: the case and its files, as the process of a diagnoser receives them.
+        trained_arrays: arrays of a learned diagnoser, by name.
+
+    Returns:
+        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
+        diagnoser does not support the simulator.
+
+    Raises:
+        RunEndedError: the diagnoser failed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return diagnose_case(request, Path(folder), trained_arrays)
+        except Exception:
+            traceback.print_exc()
+            raise RunEndedError("crashed", traceback.format_exc()) from None
+
 
 def serve_requests(
     channel: MessageChannel, policy: AccessPolicy, first_document: list[str]
 ) -> None:
-    """Answer requests of the harness until the channel is closed.
+    """Answer requests of the harness until the channel is closed; runs in the isolated process.
 
     The requests are WEIGHTS (trained arrays), QUESTION (a case) and FIT (a training) of
     `MessageKind`; the answers are READY, DONE (arrays received), ANSWER, WEIGHTS and FAILURE (with
@@ -113,28 +266,6 @@ def serve_requests(
                 # BaseException includes SystemExit: the diagnoser caused it. Of a long traceback,
                 # only the end is sent: half of the limit for a text leaves room for its encoding.
                 channel.send(MessageKind.FAILURE, error_text[-MAX_TEXT_BYTES // 2 :])
-
-
-_USED_SIMULATIONS_KEY = "simulations"
-"""Name of the array with the number of simulations that a training used."""
-
-
-def load_diagnoser(specification: Mapping[str, Any]) -> Diagnoser:
-    """Load a diagnoser from its module or file, and create it.
-
-    Args:
-        specification: name, module, and file of a plugin (empty for a module).
-    """
-    kind: type[Diagnoser] = load_class(dict(specification), Diagnoser)
-    return kind()
-
-
-def get_simulator(system: str) -> type[SystemSimulator]:
-    """Return the simulator class of a system."""
-    kind = simulators.get(system)
-    assert inspect.isclass(kind)
-    assert issubclass(kind, SystemSimulator)
-    return kind
 
 
 def diagnose_case(
@@ -223,146 +354,19 @@ def train_diagnoser(request: Mapping[str, Any]) -> tuple[Mapping[str, Array], in
         SIMULATION_COUNTER.reset()
 
 
-@dataclass(frozen=True)
-class AnswerLimits:
-    """Limits of one answer.
-
-    Attributes:
-        simulations: maximum number of simulations with simgap's simulators.
-        seconds: maximum elapsed time.
-        memory: maximum memory, MiB; 0 for no limit.
-    """
-
-    simulations: int
-    seconds: float
-    memory: int = 0
-
-
-def diagnose_in_process(
-    request: dict[str, Any], trained_arrays: Mapping[str, Array]
-) -> dict[str, Any]:
-    """Run a trusted diagnoser in this process.
+def load_diagnoser(specification: Mapping[str, Any]) -> Diagnoser:
+    """Load a diagnoser from its module or file, and create it.
 
     Args:
-        request: the case and its files, as the process of a diagnoser receives them.
-        trained_arrays: arrays of a learned diagnoser, by name.
-
-    Returns:
-        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
-        diagnoser does not support the simulator.
-
-    Raises:
-        RunEndedError: the diagnoser failed.
+        specification: name, module, and file of a plugin (empty for a module).
     """
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            return diagnose_case(request, Path(folder), trained_arrays)
-        except Exception:
-            traceback.print_exc()
-            raise RunEndedError("crashed", traceback.format_exc()) from None
+    kind: type[Diagnoser] = load_class(dict(specification), Diagnoser)
+    return kind()
 
 
-def diagnose_isolated(
-    code: TunerSpec,
-    request: dict[str, Any],
-    trained_arrays: Mapping[str, Array],
-    limits: AnswerLimits,
-    hidden: tuple[str, ...],
-) -> dict[str, Any]:
-    """Run a diagnoser in an isolated process and validate its answer.
-
-    The process ends after this answer, so that nothing passes from one case to the next. Its
-    messages have a kind of one letter: L sends the trained arrays, Q the case, and A is the answer.
-    The time limit begins with the case; starting the process and loading the arrays do not count.
-
-    Args:
-        code: where the code of the diagnoser is.
-        request: request with the texts of the recording.
-        trained_arrays: trained arrays; empty if the diagnoser needs no training.
-        limits: limits of the answer.
-        hidden: folders that the diagnoser may not read.
-
-    Returns:
-        Answer, number of simulations, processor time and elapsed seconds; or the reason in
-        ``skipped`` if the diagnoser does not support the simulator.
-
-    Raises:
-        RunEndedError: the diagnoser failed.
-    """
-    # Only the recording of a robot has further files: its model file.
-    extra_modules = ("mujoco",) if request["beside"] else ()
-    child = start_diagnoser_process(code, limits.memory, hidden, extra_modules)
-    try:
-        if trained_arrays:
-            deadline = perf_counter() + START_TIMEOUT_SECONDS
-            child.send(MessageKind.WEIGHTS, *pack_arrays(trained_arrays), deadline=deadline)
-            child.receive(deadline=deadline)  # the process confirms that it has the arrays
-        started_at = perf_counter()
-        deadline = started_at + limits.seconds
-        child.send(MessageKind.QUESTION, json.dumps(request).encode(), deadline=deadline)
-        message = child.receive(_MAX_ANSWER_BYTES, deadline)
-        seconds = perf_counter() - started_at
-        try:
-            if message.kind != MessageKind.ANSWER:
-                raise ProtocolError("it gave no answer")
-            answer = _validate_answer(message.to_document(_MAX_ANSWER_BYTES), limits)
-        except (ProtocolError, InputError, KeyError, TypeError, ValueError) as error:
-            raise child.fail_with_protocol_error(f"{error}"[:500]) from None
-        return {**answer, "seconds": seconds}
-    finally:
-        child.end()
-
-
-def _validate_answer(message: Any, limits: AnswerLimits) -> dict[str, Any]:
-    """Validate the message of an isolated diagnoser, which may be malicious.
-
-    Args:
-        message: document that the process of the diagnoser sent.
-        limits: limits of the answer, which the reported costs cannot exceed.
-
-    Returns:
-        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
-        diagnoser does not support the simulator.
-
-    Raises:
-        ProtocolError: the reported costs are impossible.
-    """
-    simulations, seconds = int(message["simulations"]), float(message["processor_seconds"])
-    # A billion seconds are 32 years; NaN is refused, too.
-    if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
-        raise ProtocolError("it reported an impossible number of simulations")
-    if skipped := str(message.get("skipped", ""))[:_MAX_REASON_LENGTH]:
-        empty_answer = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
-        return {**empty_answer, "skipped": skipped}
-    answer = Answer.of(message["answer"]).document()
-    return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
-
-
-def start_diagnoser_process(
-    code: TunerSpec, memory: int, hidden: tuple[str, ...], extra_modules: tuple[str, ...] = ()
-) -> IsolatedProcess:
-    """Start the isolated process of a diagnoser from the fork server, and wait until it is ready.
-
-    Args:
-        code: where the code of the diagnoser is.
-        memory: maximum memory, MiB; 0 for no limit.
-        hidden: folders that the process must not read.
-        extra_modules: further modules that the fork server loads first, such as MuJoCo for robots.
-
-    Returns:
-        The process; the caller ends it.
-    """
-    child = start_part_process(
-        code,
-        "bench.diagnosis_benchmark.diagnoser_process:serve_requests",
-        memory,
-        hidden,
-        # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
-        [PRELOAD_MODULE, *extra_modules],
-    )
-    try:
-        child.wait_until_ready()
-    except BaseException:
-        child.end()
-        raise
-    return child
+def get_simulator(system: str) -> type[SystemSimulator]:
+    """Return the simulator class of a system."""
+    kind = simulators.get(system)
+    assert inspect.isclass(kind)
+    assert issubclass(kind, SystemSimulator)
+    return kind

@@ -1,6 +1,7 @@
-"""Write the tables, figures and HTML report of a comparison of diagnosers and print a summary.
+"""Report a comparison of diagnosers: tables, figures, HTML report and printed summary.
 
-HTML report of a comparison of diagnosers: its tables, conclusions and warnings.
+The conclusions and warnings of the HTML report are computed here, the tables in `result_tables`,
+and the charts in `diagnoser_figures`.
 """
 
 from __future__ import annotations
@@ -42,6 +43,22 @@ from bench.pages.html_page import HtmlPage
 from bench.pages.template import render_text
 from sims.core.files import write_atomically
 
+ANSWERS_TABLE_FILE = "items.csv"
+"""File with one row per answer."""
+_PAGE_TEMPLATE = Path(__file__).with_name("diagnosers.html")
+_PAGE_DIGITS = 6
+"""Number of significant digits of the tables that are embedded in the page."""
+_SUMMARY_TEMPLATE = Path(__file__).with_name("diagnosers.txt")
+_SUMMARY_METRICS = {
+    "false alarms": "false alarms",
+    "named, alone": "named alone",
+    PRIMARY_METRIC: "in a set of 2",
+    "pairs: both named": "both of two",
+    "foreign causes: unknown or partial": "foreign",
+}
+"""Metrics of the printed leaderboard, with the headings of their columns."""
+_MAX_LISTED_FAILURES = 5
+"""Maximum number of failed answers that are printed."""
 _SIGNIFICANCE_LEVEL = 0.05
 """Maximum Holm-corrected p-value for a significant difference between two diagnosers."""
 
@@ -129,11 +146,6 @@ def summarise_unsupported(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:
     ]
 
 
-_PAGE_TEMPLATE = Path(__file__).with_name("diagnosers.html")
-_DIGITS = 6
-"""Number of significant digits of stored numbers."""
-
-
 def render_page(data: DiagnoserReportData) -> str:
     """Render the HTML report of a comparison of diagnosers.
 
@@ -146,7 +158,7 @@ def render_page(data: DiagnoserReportData) -> str:
     failures = build_failure_table(data.rows, data.order)
     tables = {**data.tables, "failures": failures, "items": data.rows}
     tables |= build_chart_tables(data)
-    page.add_tables(tables, _DIGITS)
+    page.add_tables(tables, _PAGE_DIGITS)
     groups, confusion, costs = (data.tables[name] for name in ("groups", "confusion", "costs"))
     # Entries of the page's menus; the first choices are set below.
     metrics = list(dict.fromkeys(groups["metric"]))
@@ -179,10 +191,6 @@ def render_page(data: DiagnoserReportData) -> str:
             else str(confused[0])
         ),
     )
-
-
-ANSWERS_TABLE_FILE = "items.csv"
-"""File with one row per answer."""
 
 
 def write_report(
@@ -248,19 +256,6 @@ def write_report(
     return len(failed)
 
 
-_TEMPLATE = Path(__file__).with_name("diagnosers.txt")
-_SUMMARY_METRICS = {
-    "false alarms": "false alarms",
-    "named, alone": "named alone",
-    PRIMARY_METRIC: "in a set of 2",
-    "pairs: both named": "both of two",
-    "foreign causes: unknown or partial": "foreign",
-}
-"""Metrics of the printed leaderboard, with the headings of their columns."""
-_MAX_LISTED_FAILURES = 5
-"""Maximum number of failed answers that are printed."""
-
-
 def _render_summary(
     data: DiagnoserReportData, failed: pd.DataFrame, undetectable_count: int, report_path: Path
 ) -> list[str]:
@@ -274,7 +269,7 @@ def _render_summary(
     """
     table = data.tables["table"]
     return render_text(
-        _TEMPLATE,
+        _SUMMARY_TEMPLATE,
         shown=data,
         shares={metric: index_by_diagnoser(table, metric) for metric in _SUMMARY_METRICS},
         columns=list(_SUMMARY_METRICS.values()),

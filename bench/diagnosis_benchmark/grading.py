@@ -6,7 +6,7 @@ An answer is a dictionary as `explain` writes it (DESIGN §6).
 |---|---|---|
 | right | all | clean: adequate; single, double: all causes, no other; foreign: unknown or partial |
 | set | single, double | the cause is in a set of effects that the data cannot distinguish |
-| class | single, double | an effect equivalent in any data is named (`EQUIVALENT_EFFECTS`) |
+| class | single, double | an effect equivalent in any data is named (`equivalent_effects`) |
 | one | double | one of the two is named (alone or in a set), the other is not |
 | wrong | single, double, foreign | another effect is named; foreign: as full explanation |
 | extra | single | the cause is named, and another one in addition |
@@ -26,12 +26,13 @@ from typing import Any
 
 from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
 from bench.diagnosis_benchmark.case_generation.effect_coefficients import list_coefficient_names
-from bench.diagnosis_benchmark.case_set import find_equivalent_effects
+from bench.diagnosis_benchmark.case_generation.equivalent_effects import find_equivalent_effects
 
 NamedSets = list[tuple[str, ...]]
 CoverageCheck = Callable[[str, tuple[str, ...]], bool]
 EquivalentEffects = Callable[[str], frozenset[str]]
-MAX_SET_SIZE = 2  # maximum size of a set in which a cause counts as identified
+MAX_SET_SIZE = 2
+"""Maximum number of effects of a set in which a cause counts as identified."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,10 @@ def grade_answer(case: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grad
     # One tuple of names for each cause: the leading effect, then its alternatives.
     sets = list_named_sets(verdict)
     outcome, set_size, class_size = grade_sets(
-        case.kind, case.effects, verdict, lambda effect: find_equivalent_effects(case, effect)
+        case.kind,
+        case.effects,
+        verdict,
+        lambda effect: find_equivalent_effects(case.system, case.driven, effect),
     )
     covered = {}
     # An unmodelled cause has no coefficients, and parameters fitted without it are wrong.

@@ -1,4 +1,7 @@
-"""Layout of figures: panels, titles, axes and captions, drawn by Matplotlib."""
+"""Layout of figures: panels, titles, axes and captions, drawn by Matplotlib.
+
+No figure is made by pyplot, so that a notebook's backend, settings and open figures are unchanged.
+"""
 
 from __future__ import annotations
 

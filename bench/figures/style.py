@@ -1,8 +1,7 @@
-"""Style of all figures: palette, markers, canvas, panels, legend, caption.
+"""Style of all figures: palette, greys, markers and line styles.
 
 The style is made for print: every tuner has its own marker and line style in addition to its
-colour, and colours differ in lightness. No figure is made by pyplot, so that a notebook's backend,
-settings and open figures are unchanged.
+colour, and colours differ in lightness.
 """
 
 from __future__ import annotations
@@ -59,7 +58,6 @@ HELD_OUT_GREY = "#E4E4E4"
 RECORDED_PART_GREY = "#EEEEEE"
 """Background of the recorded part of a film, and of errors that count as equal."""
 
-# Dark and light colours alternate, so that neighbours differ in greyscale, too.
 BASE_MODEL_LINE: Mapping[str, Any] = {
     "color": VERMILION,
     "linestyle": (0, (5, 2)),
@@ -77,6 +75,7 @@ BASE_MODEL_MARKER: Mapping[str, Any] = {
 """Marker style of the fitted base model: open squares, recognised without colour."""
 EXTENDED_MODEL_MARKER: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "color": BLUE}
 """Marker style of the extended model."""
+# Dark and light colours alternate, so that neighbours differ in greyscale, too.
 _COLOURS = (BLACK, ORANGE, BLUE, SKY_BLUE, VERMILION, GREEN, PURPLE, GREY, VIOLET, BROWN)
 
 _DARK = {

@@ -1,6 +1,4 @@
-"""Track the ball in a film, and write the track as a recording.
-
-Convert the track of a ball to heights in metres.
+"""Track the ball in a film, convert its track to heights in metres, and write a recording.
 
 If the camera is known, heights follow exactly. Otherwise: along the straight line of a vertical
 fall the inverse depth, and so the ball's radius r in pixels, is linear in the position s in the
@@ -44,6 +42,21 @@ from sims.vision.pinhole_camera import (
 )
 from sims.vision.video_files import VideoFile
 
+DEFAULT_GRAVITY = 9.81
+"""Gravity assumed for a film, m/s^2."""
+_MIN_FLIGHT_FRAMES = 7
+"""Minimum number of frames of a flight; fewer do not determine a parabola."""
+_MIN_FLIGHT_EXTENT = 0.3
+"""Minimum extent of a flight, in ball radii, or in metres for heights."""
+_MIN_HOLD_SECONDS = 0.25
+"""Minimum duration in seconds for which a ball is held before its release."""
+_REPORTED_SCALE_DIFFERENCE = 0.05
+"""Relative difference between the scales from the fall and the diameter that is reported."""
+_BOUNCE_SEARCH_SECONDS = 0.1
+"""Time in seconds around the end of a flight and the start of the next in which they may meet."""
+_REWEIGHTED_FITS = 3
+"""Number of reweighted line fits to the radius after the first, unweighted fit."""
+
 _TABLE_DIGITS = 9
 """Number of significant digits in the table, finer than a pixel's noise."""
 
@@ -79,6 +92,43 @@ class TrackingResult(NamedTuple):
             "noise_metres": self.noise,
             "notes": self.notes,
         }
+
+
+@dataclass(frozen=True)
+class BallHeights:
+    """Heights of a ball's centre over time.
+
+    Attributes:
+        z: (n,) heights in metres.
+        radius: Radius of the ball in metres.
+        method: Method by which heights were found.
+        notes: Notes for the user.
+    """
+
+    z: Array
+    radius: float
+    method: str
+    notes: tuple[str, ...] = ()
+
+
+TrackFigureWriter = Callable[[BallTrack, BallHeights, slice, str], tuple[bytes, bytes | None]]
+"""Draws a track, its heights, the recorded frames and a title, as a PNG and a PDF or None."""
+
+
+class _Flight(NamedTuple):
+    """A flight between bounces.
+
+    Attributes:
+        curve: Coefficients of its parabola, highest power first.
+        begin: Time of its first frame, s.
+        end: Time of its last frame, s.
+        weight: Inverse variance of its curvature, up to a constant factor.
+    """
+
+    curve: Array
+    begin: float
+    end: float
+    weight: float
 
 
 def track_film(
@@ -135,7 +185,7 @@ def track_film(
     if first > track.visible_frames[0]:
         until = f"the ball is held until {track.times[first]:.2f} s"
         notes.append(f"{until}; earlier frames are left out")
-    noise = _estimate_height_noise(track, heights, kept_frames)
+    noise = _estimate_sample_noise(track, heights, kept_frames)
 
     # The recording and its figures are published together, so that none exists without the others.
     png, pdf_content = draw(track, heights, kept_frames, f"{video.name}: {heights.method}")
@@ -155,32 +205,6 @@ def track_film(
     return TrackingResult(
         tuple(notes), frames, count, heights.method, float(track.noise), noise, lines
     )
-
-
-def _estimate_height_noise(track: BallTrack, heights: BallHeights, part: slice) -> float:
-    """Estimate 1 sigma of a height, m: the larger of the scatter of neighbours and of flights.
-
-    Neighbouring frames show fast noise; the deviations from smooth flights show slow errors, too.
-
-    Args:
-        track: the tracked ball, with the times of the frames.
-        heights: heights of the ball, m, NaN where it was not detected.
-        part: frames that are recorded.
-    """
-    heights_of_part = heights.z[part]
-    noise = float(
-        np.nanmax(
-            [
-                estimate_roughness(heights_of_part),
-                estimate_height_noise(track.times[part], heights_of_part),
-                0.0,
-            ]
-        )
-    )
-    if noise > 0:
-        return noise
-    # A few frames give neither estimate: use the noise in pixels, scaled by the median radius.
-    return track.noise * heights.radius / float(np.nanmedian(track.radius))
 
 
 def _convert_to_heights(
@@ -210,92 +234,6 @@ def _convert_to_heights(
     if scale == "diameter" and diameter is None:
         raise InputError("scale diameter: expected the ball's diameter in metres")
     return compute_heights_by_scale(track, diameter, scale)
-
-
-def _build_recording(
-    track: BallTrack,
-    heights: BallHeights,
-    noise: float,
-    part: slice,
-    video: Path,
-) -> Recording:
-    """Build the recording: the height z of the ball (m), and its track in pixels as extra columns.
-
-    Args:
-        track: position and radius of the ball in each frame, pixels.
-        heights: height of the ball in each frame, m.
-        noise: standard deviation of z, m.
-        part: frames to record, those after the release of the ball.
-        video: path of the film, for the title.
-    """
-    pixels = {"u": track.u, "v": track.v, "radius_px": track.radius}
-    run = Run(
-        "1",
-        make_read_only(track.times[part]),
-        channels={"z": make_read_only(heights.z[part])},
-        inputs={},
-        constants={},
-        initial={},
-        held_out=False,
-        extra={name: make_read_only(values[part]) for name, values in pixels.items()},
-    )
-    title = f"{video.name}, tracked; z {heights.method}"
-    constants = {"radius": heights.radius, "gravity": DEFAULT_GRAVITY}
-    extra_units = dict.fromkeys(pixels, "px")
-    return Recording(Path(), BallSystem.name, title, constants, {"z": noise}, (run,), extra_units)
-
-
-DEFAULT_GRAVITY = 9.81
-"""Gravity assumed for a film, m/s^2."""
-_MIN_FLIGHT_FRAMES = 7
-"""Minimum number of frames of a flight; fewer do not determine a parabola."""
-_MIN_FLIGHT_EXTENT = 0.3
-"""Minimum extent of a flight, in ball radii, or in metres for heights."""
-_MIN_HOLD_SECONDS = 0.25
-"""Minimum duration in seconds for which a ball is held before its release."""
-_REPORTED_SCALE_DIFFERENCE = 0.05
-"""Relative difference between the scales from the fall and the diameter that is reported."""
-_BOUNCE_SEARCH_SECONDS = 0.1
-"""Time in seconds around the end of a flight and the start of the next in which they may meet."""
-_REWEIGHTED_FITS = 3
-"""Number of reweighted line fits to the radius after the first, unweighted fit."""
-
-
-@dataclass(frozen=True)
-class BallHeights:
-    """Heights of a ball's centre over time.
-
-    Attributes:
-        z: (n,) heights in metres.
-        radius: Radius of the ball in metres.
-        method: Method by which heights were found.
-        notes: Notes for the user.
-    """
-
-    z: Array
-    radius: float
-    method: str
-    notes: tuple[str, ...] = ()
-
-
-TrackFigureWriter = Callable[[BallTrack, BallHeights, slice, str], tuple[bytes, bytes | None]]
-"""Draws a track, its heights, the recorded frames and a title, as a PNG and a PDF or None."""
-
-
-class _Flight(NamedTuple):
-    """A flight between bounces.
-
-    Attributes:
-        curve: Coefficients of its parabola, highest power first.
-        begin: Time of its first frame, s.
-        end: Time of its last frame, s.
-        weight: Inverse variance of its curvature, up to a constant factor.
-    """
-
-    curve: Array
-    begin: float
-    end: float
-    weight: float
 
 
 def compute_heights_by_camera(track: BallTrack, filmed: FilmDescription) -> BallHeights:
@@ -508,7 +446,56 @@ def _estimate_ground_position(track: BallTrack, q: Array, flights: list[_Flight]
     return float(np.nanpercentile(q, 99.5)) if len(track.visible_frames) else 0.0
 
 
-def estimate_height_noise(times: Array, z: Array) -> float:
+def find_release_frame(track: BallTrack) -> int:
+    """Find the frame at which the ball begins to move; the first one unless it is held before.
+
+    A hand may hold the ball at the beginning of the film. It counts as held if it stays for at
+    least `_MIN_HOLD_SECONDS`.
+
+    Args:
+        track: Centres of the ball in the frames of a film.
+    """
+    fall_position, visible_frames = _compute_fall_position(track), track.visible_frames
+    # Five frames, so that an error in one of them does not matter.
+    start = float(np.median(fall_position[visible_frames[:5]]))
+    # Motion up to a pixel, or four standard deviations of the noise, is a trembling hand or an
+    # error of the outline, not a fall.
+    is_moved = np.abs(fall_position[visible_frames] - start) > max(1.0, 4 * track.noise)
+    first = int(visible_frames[0])
+    if not is_moved.any():
+        return first
+    release = int(visible_frames[np.argmax(is_moved)])
+    hold_seconds = track.times[release] - track.times[first]
+    return first if hold_seconds < _MIN_HOLD_SECONDS else release
+
+
+def _estimate_sample_noise(track: BallTrack, heights: BallHeights, part: slice) -> float:
+    """Estimate 1 sigma of a height, m: the larger of the scatter of neighbours and of flights.
+
+    Neighbouring frames show fast noise; the deviations from smooth flights show slow errors, too.
+
+    Args:
+        track: the tracked ball, with the times of the frames.
+        heights: heights of the ball, m, NaN where it was not detected.
+        part: frames that are recorded.
+    """
+    heights_of_part = heights.z[part]
+    noise = float(
+        np.nanmax(
+            [
+                estimate_roughness(heights_of_part),
+                _estimate_flight_noise(track.times[part], heights_of_part),
+                0.0,
+            ]
+        )
+    )
+    if noise > 0:
+        return noise
+    # A few frames give neither estimate: use the noise in pixels, scaled by the median radius.
+    return track.noise * heights.radius / float(np.nanmedian(track.radius))
+
+
+def _estimate_flight_noise(times: Array, z: Array) -> float:
     """Estimate the height noise from the residuals of a cubic fitted to each flight.
 
     A cubic can represent gravity and a drag. White noise estimated from neighbouring samples alone
@@ -534,24 +521,34 @@ def estimate_height_noise(times: Array, z: Array) -> float:
     return float(np.sqrt(squares / degrees_of_freedom)) if degrees_of_freedom else float("nan")
 
 
-def find_release_frame(track: BallTrack) -> int:
-    """Find the frame at which the ball begins to move; the first one unless it is held before.
-
-    A hand may hold the ball at the beginning of the film. It counts as held if it stays for at
-    least `_MIN_HOLD_SECONDS`.
+def _build_recording(
+    track: BallTrack,
+    heights: BallHeights,
+    noise: float,
+    part: slice,
+    video: Path,
+) -> Recording:
+    """Build the recording: the height z of the ball (m), and its track in pixels as extra columns.
 
     Args:
-        track: Centres of the ball in the frames of a film.
+        track: position and radius of the ball in each frame, pixels.
+        heights: height of the ball in each frame, m.
+        noise: standard deviation of z, m.
+        part: frames to record, those after the release of the ball.
+        video: path of the film, for the title.
     """
-    fall_position, visible_frames = _compute_fall_position(track), track.visible_frames
-    # Five frames, so that an error in one of them does not matter.
-    start = float(np.median(fall_position[visible_frames[:5]]))
-    # Motion up to a pixel, or four standard deviations of the noise, is a trembling hand or an
-    # error of the outline, not a fall.
-    is_moved = np.abs(fall_position[visible_frames] - start) > max(1.0, 4 * track.noise)
-    first = int(visible_frames[0])
-    if not is_moved.any():
-        return first
-    release = int(visible_frames[np.argmax(is_moved)])
-    hold_seconds = track.times[release] - track.times[first]
-    return first if hold_seconds < _MIN_HOLD_SECONDS else release
+    pixels = {"u": track.u, "v": track.v, "radius_px": track.radius}
+    run = Run(
+        "1",
+        make_read_only(track.times[part]),
+        channels={"z": make_read_only(heights.z[part])},
+        inputs={},
+        constants={},
+        initial={},
+        held_out=False,
+        extra={name: make_read_only(values[part]) for name, values in pixels.items()},
+    )
+    title = f"{video.name}, tracked; z {heights.method}"
+    constants = {"radius": heights.radius, "gravity": DEFAULT_GRAVITY}
+    extra_units = dict.fromkeys(pixels, "px")
+    return Recording(Path(), BallSystem.name, title, constants, {"z": noise}, (run,), extra_units)

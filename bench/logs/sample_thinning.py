@@ -5,6 +5,8 @@ model of the robot contains: at 500 Hz and more they, and not the motion, decide
 k-th sample is kept, with the largest k that preserves all motion: the other samples follow from a
 cubic spline through the kept ones (C. de Boor, A Practical Guide to Splines, 1978, chapter 4) as
 well as from one through every second sample.
+
+`take_every_nth` thins a run by a factor that the caller states, whatever motion is lost.
 """
 
 from __future__ import annotations
@@ -150,6 +152,10 @@ def take_every_nth(run: Run, factor: int) -> Run:
 
     An input becomes its mean between the kept samples, so that it has the same effect. Columns that
     are neither channels nor inputs (`extra`) are left out.
+
+    Args:
+        run: Recorded run: times, channels and inputs.
+        factor: The number n.
     """
     kept = np.arange(0, run.times.size, factor)
     return replace(
@@ -183,15 +189,15 @@ def _average_input(times: Array, values: Array, kept: Indices) -> Array:
     return means
 
 
-def keeps_samples(thinned_run: Run, run: Run, factor: int) -> bool:
-    """Return whether every channel keeps about its expected number of recorded samples.
+def has_enough_samples(thinned_run: Run, run: Run, factor: int) -> bool:
+    """Return whether every channel of a thinned run has about its expected number of samples.
 
     A channel that is recorded at a lower rate than the others could lose nearly all its samples.
 
     Args:
-        thinned_run: the run after subsampling.
-        run: the run before.
-        factor: every `factor`-th sample was kept.
+        thinned_run: The run after subsampling.
+        run: The run before.
+        factor: Every `factor`-th sample was kept.
     """
     for name, values in run.channels.items():
         sample_count = int(np.isfinite(values).sum())

@@ -1,9 +1,10 @@
-"""Scores of a misspecification study, in the original and in the extended simulator.
+"""Statistics of a misspecification study: scores and ranks of tuners in both simulators.
 
-They are signed and absolute errors of parameters, prediction errors of unseen runs, and ranks of
-the tuners. The value of a target is the mean over its seeds. Means and intervals are over targets
-(95 % percentile bootstrap). Errors of parameters are in training widths. A failed run has no
-parameter errors here; it is counted as a failure and ranks last on its target.
+The simulators are the original and the extended one. Scores are signed and absolute errors of
+parameters, and prediction errors of unseen runs. The value of a target is the mean over its seeds.
+Means and intervals are over targets (95 % percentile bootstrap). Errors of parameters are in
+training widths. A failed run has no parameter errors here; it is counted as a failure and ranks
+last on its target.
 """
 
 from __future__ import annotations

@@ -1,13 +1,10 @@
-"""Declarative chart specification: what the page's script draws from a table in the page.
+"""Charts of pages: their declarative specification, and the same charts drawn by Matplotlib.
 
 A chart has panels, a panel has series, and a series names columns of a table (CSV text in the
-page): the drawing, the values at the cursor and the saved CSV contain the same numbers. In
-addition, the page contains the same figure drawn by Matplotlib: for print, for use without
-JavaScript, and to be saved as SVG and PNG, and as PDF if requested.
-
-Draw a chart of a page with Matplotlib: the same panels, series and tables, for print.
-
-Of a chart's facets, the printed figure has what the page shows at first.
+page): the page's script draws it, so that the drawing, the values at the cursor and the saved CSV
+contain the same numbers. In addition, the page contains the same figure drawn by Matplotlib: for
+print, for use without JavaScript, and to be saved as SVG and PNG, and as PDF if requested. Of a
+chart's facets, this printed figure has what the page shows at first.
 """
 
 from __future__ import annotations
@@ -30,10 +27,23 @@ if TYPE_CHECKING:
 
     from bench.pages.page_table import Table
 
-
 Scale = Literal["linear", "log", "symlog"]
 """Scale of an axis; symlog is linear from 0 to 1 and logarithmic above."""
 SeriesKind = Literal["line", "steps", "points", "bars"]
+Tables = Mapping[str, "pd.DataFrame | Table"]
+"""Tables by name, from which the panels of a chart are drawn."""
+PANEL_SIZE = (4.3, 4.0)
+"""Width and height of a printed panel in inches."""
+_FOOT_SHARE = 0.035
+"""Height of a strip at the bottom of a panel, as a share of the panel."""
+_FOOT_MARGIN = 0.12
+"""Margin above and below the series that keeps them off a strip and its name, as their share."""
+_MIN_NAMED_DECADES = 1.5
+"""Minimum width of a strip that has its name, in decades of a logarithmic axis."""
+_NAME_LINE = 34
+"""Maximum line length of a category's name in print, in characters."""
+_MARKED_POINTS = 11
+"""Approximate number of markers on a line whose axis has no ticks of its own."""
 
 
 @dataclass(frozen=True)
@@ -112,11 +122,23 @@ def make_method_series(
             y,
             look,
             {column: name, **(where or {})},
-            shift=compute_category_offset(index, len(styles)) if is_shifted else 0.0,
+            shift=_compute_category_offset(index, len(styles)) if is_shifted else 0.0,
             **options,
         )
         for index, (name, look) in enumerate(styles.items())
     )
+
+
+def _compute_category_offset(place: int, count: int) -> float:
+    """Compute a small shift along a category axis that places points side by side.
+
+    The points of one category are spread over 0.6 of its width.
+
+    Args:
+        place: place of the point among those of the category.
+        count: number of these points.
+    """
+    return (place - (count - 1) / 2) * 0.6 / count
 
 
 @dataclass(frozen=True)
@@ -264,21 +286,6 @@ class Chart:
         spec = {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
         del spec["static"]
         return spec | {"panels": [asdict(panel) for panel in self.panels]}
-
-
-Tables = Mapping[str, "pd.DataFrame | Table"]
-PANEL_SIZE = (4.3, 4.0)
-"""Width and height of a panel in inches."""
-_FOOT_SHARE = 0.035
-"""Height of a strip at the bottom of a panel, as a share of the panel."""
-_FOOT_MARGIN = 0.12
-"""Margin above and below the series that keeps them off a strip and its name, as their share."""
-_MIN_NAMED_DECADES = 1.5
-"""Minimum width of a strip that has its name, in decades of a logarithmic axis."""
-_NAME_LINE = 34
-"""Maximum line length of a category's name, in characters."""
-_MARKED_POINTS = 11
-"""Approximate number of markers on a line whose axis has no ticks of its own."""
 
 
 def select_first_panels(panels: Iterable[Panel], shown: Collection[str]) -> list[Panel]:
@@ -567,15 +574,3 @@ def _draw_rules(axis: Axes, rules: Sequence[ReferenceLine], horizontal: bool) ->
             axis.axhline(rule.value, **line)
             position = {"xy": (0, rule.value), "xycoords": ("axes fraction", "data")}
             axis.annotate(rule.says, xytext=(4, -10), **position, **text)
-
-
-def compute_category_offset(place: int, count: int) -> float:
-    """Compute a small shift along a category axis that places points side by side.
-
-    The points of one category are spread over 0.6 of its width.
-
-    Args:
-        place: place of the point among those of the category.
-        count: number of these points.
-    """
-    return (place - (count - 1) / 2) * 0.6 / count

@@ -1,4 +1,7 @@
-"""Format text and numbers for people, and tables as CSV text that is safe in a spreadsheet."""
+"""Format text, numbers and tables for people: for pages, terminals and spreadsheets.
+
+Text and names from files and plugins are cleaned, and CSV text is safe to open in a spreadsheet.
+"""
 
 from __future__ import annotations
 

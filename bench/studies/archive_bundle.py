@@ -1,11 +1,11 @@
-"""Pack a result folder into one archive with a manifest of file hashes, and verify an archive.
+"""Pack a result folder into one archive with a manifest of file hashes, and unpack it safely.
 
 The same folder gives the same bytes (with the same zlib): names are sorted, times are fixed. Before
 an archive of unknown origin is unpacked, it is checked for attacks: paths outside the folder,
 links, more bytes than stated or than any result has.
 
 The folder is that of a comparison or an explanation; the archive is meant for the supplement of a
-paper. `simgap verify` checks whether an archive made elsewhere is consistent.
+paper. `bench.studies.result_verification` checks whether the content of an archive is consistent.
 """
 
 from __future__ import annotations
@@ -33,22 +33,18 @@ from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.diagnosis.verdict import VERDICT_FILE
 from bench.misspecification.calibration_recording import MODEL_LABELS
 from bench.schemas import find_violations
-from bench.studies.result_verification import (
-    RECORDINGS_FOLDER,
-    ExplanationVerification,
-    PrintLine,
-    VerificationFailure,
-    VerificationResult,
-    print_failures,
-    verify_comparison,
-    verify_extended_model,
-)
 from bench.studies.study_kinds import list_study_folders
 from sims.core.files import atomic_replacement
 from sims.core.simulator import InputError
 from sims.extended_simulator import EXTENDED_MODEL_FILE
 
 MANIFEST_FILE = "manifest.json"
+_FORMAT_VERSION = 1
+"""Version of the manifest's format."""
+_PLUGIN_FOLDER = "plugins"
+"""Folder of plugin files in the archive of a comparison."""
+RECORDINGS_FOLDER = "recordings"
+"""Folder of recordings in the archive of an explanation."""
 MAX_UNPACKED_BYTES = 8 << 30
 """Maximum size of an unpacked archive in bytes."""
 MAX_COMPRESSION_RATIO = 200
@@ -68,252 +64,6 @@ _ENCRYPTED_FLAG = 0x1
 """Flag of an encrypted file in a zip archive."""
 _MAX_PATH_LENGTH = 1000
 """Maximum length of a path in characters."""
-
-
-def write_archive(
-    archive: Path, name: str, files: Mapping[str, Path], metadata: Mapping[str, Any]
-) -> None:
-    """Write an archive completely or not at all.
-
-    Args:
-        archive: Path of a new file.
-        name: Name of the folder in the archive.
-        files: Path of each file on disk, by its path in that folder.
-        metadata: Entries of the manifest in addition to the files.
-
-    Raises:
-        InputError: The archive exists already, or a file cannot be read or written.
-    """
-    if archive.exists():
-        raise InputError(f"{archive}: exists already; name another file with --out")
-    file_entries = [
-        {"path": path, "bytes": file.stat().st_size, "sha256": compute_sha256(file)}
-        for path, file in sorted(files.items())
-    ]
-    manifest = json.dumps({**metadata, "files": file_entries}, indent=1, ensure_ascii=False) + "\n"
-    try:
-        archive.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_replacement(archive) as partial, zipfile.ZipFile(partial, "w") as packed:
-            packed.writestr(
-                _make_zip_header(f"{name}/{MANIFEST_FILE}"),
-                manifest,
-                compress_type=zipfile.ZIP_DEFLATED,
-                compresslevel=9,
-            )
-            for path, file in sorted(files.items()):
-                with (
-                    file.open("rb") as source,
-                    packed.open(_make_zip_header(f"{name}/{path}"), "w") as target,
-                ):
-                    shutil.copyfileobj(source, target, _BLOCK_BYTES)
-    except OSError as error:
-        raise InputError(f"{archive}: cannot be written ({error.strerror})") from None
-
-
-def _make_zip_header(path: str) -> zipfile.ZipInfo:
-    """Make the header of a file in the zip archive, with fixed time, permissions and system.
-
-    The bytes of the archive then depend on the content of the files only.
-    """
-    entry = zipfile.ZipInfo(path, _ZIP_EPOCH)
-    entry.create_system = 3  # Always Unix, so that the bytes do not depend on this machine.
-    entry.external_attr = (stat.S_IFREG | 0o644) << 16
-    entry.compress_type = zipfile.ZIP_DEFLATED
-    return entry
-
-
-class UnpackedArchive(NamedTuple):
-    """An archive that has been unpacked.
-
-    Attributes:
-        folder: Temporary folder with its content.
-        manifest: Its manifest.
-        mismatches: Differences from the manifest.
-    """
-
-    folder: Path
-    manifest: dict[str, Any]
-    mismatches: list[VerificationFailure]
-
-
-@contextmanager
-def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
-    """Context that unpacks an archive into a temporary folder.
-
-    Args:
-        archive: path of the archive, which may be of unknown origin.
-
-    Yields:
-        The folder, which is deleted afterwards, the manifest, and the differences from it.
-
-    Raises:
-        InputError: It is not an archive of simgap, or unpacking it could be harmful.
-    """
-    try:
-        with zipfile.ZipFile(archive) as packed, TemporaryDirectory(prefix="simgap-") as folder:
-            entries = _check_entries(archive, packed)
-            top_folder = _find_top_folder(archive, entries)
-            manifest = _read_manifest(archive, packed, top_folder)
-            sizes_and_hashes = {}
-            for entry in entries:
-                path = Path(folder, *PurePosixPath(entry.filename).parts)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                # No more bytes are read than the entry states, however many it contains.
-                with packed.open(entry) as source, path.open("wb") as target:
-                    shutil.copyfileobj(source, target, _BLOCK_BYTES)
-                name = entry.filename.removeprefix(f"{top_folder}/")
-                sizes_and_hashes[name] = path.stat().st_size, compute_sha256(path)
-            # The manifest does not list itself.
-            del sizes_and_hashes[MANIFEST_FILE]
-            yield UnpackedArchive(
-                Path(folder, top_folder),
-                manifest,
-                list(_compare_with_manifest(manifest, sizes_and_hashes)),
-            )
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError) as error:
-        raise InputError(f"{archive}: expected an archive of simgap bundle; {error}") from None
-    except OSError as error:
-        raise InputError(f"{archive}: cannot be read ({error.strerror or error})") from None
-
-
-def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
-    """Return the entries of an archive if all of them can be unpacked safely.
-
-    Args:
-        archive: path of the archive, for messages.
-        packed: archive, open for reading.
-
-    Raises:
-        InputError: One cannot.
-    """
-    entries = packed.infolist()
-    if len(entries) > _MAX_FILES:
-        raise _make_refusal(archive, f"{len(entries)} files, at most {_MAX_FILES} expected")
-    for member in entries:
-        if problem := _find_entry_error(member):
-            raise _make_refusal(archive, f"{member.filename[:80]!r} {problem}")
-    # Two names that a file system treats as equal would overwrite each other's file.
-    repeated_names = [
-        name for name, n in Counter(e.filename.casefold() for e in entries).items() if n > 1
-    ]
-    if repeated_names:
-        raise _make_refusal(archive, f"{repeated_names[0]!r} is in it twice")
-    total, size = sum(member.file_size for member in entries), archive.stat().st_size
-    if total > MAX_UNPACKED_BYTES or (
-        total > _MIN_BYTES_FOR_RATIO_CHECK and total > MAX_COMPRESSION_RATIO * size
-    ):
-        raise _make_refusal(archive, f"it would unpack from {size} bytes to {total}")
-    # Such data are a comment at the end, or bytes before the first file.
-    if packed.comment or min((e.header_offset for e in entries), default=0) > 0:
-        raise _make_refusal(archive, "it contains data that belong to no file")
-    return entries
-
-
-def _find_entry_error(entry: zipfile.ZipInfo) -> str:
-    """Return why an entry of an archive must not be unpacked; empty if it may be.
-
-    An archive of unknown origin could contain paths outside its folder, links or devices, which
-    would overwrite files of the user.
-    """
-    name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
-    parts = name.split("/")
-    # If the two stored names of an entry differ, programs would unpack it to different paths.
-    if name != entry.orig_filename or "\\" in name or ":" in name or not name.isprintable():
-        return "is not a plain path"
-    if len(name) > _MAX_PATH_LENGTH or any(part in ("", ".", "..") for part in parts):
-        return "is not a path inside its folder"
-    if kind not in (0, stat.S_IFREG) or entry.is_dir():
-        return "is a link, a folder or a device; expected a file"
-    if entry.flag_bits & _ENCRYPTED_FLAG:
-        return "is encrypted"
-    if entry.compress_type not in _COMPRESSION_METHODS:
-        return "is compressed in a way that simgap does not use"
-    return ""
-
-
-def _make_refusal(archive: Path, reason: str) -> InputError:
-    return InputError(f"{archive}: refused: {reason}; nothing was unpacked")
-
-
-def _find_top_folder(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
-    """Return the single top-level folder of an archive, which contains the manifest.
-
-    Args:
-        archive: path of the archive, for messages.
-        entries: its entries.
-
-    Raises:
-        InputError: the archive has another form, so it was not made by `simgap bundle`.
-    """
-    paths = {entry.filename for entry in entries}
-    top_folders = {path.partition("/")[0] for path in paths}
-    if len(top_folders) == 1:
-        (top_folder,) = top_folders
-        if f"{top_folder}/{MANIFEST_FILE}" in paths:
-            return top_folder
-    raise InputError(
-        f"{archive}: expected an archive of simgap bundle: one folder with {MANIFEST_FILE} in it"
-    )
-
-
-def _read_manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any]:
-    """Read and validate the manifest of an archive, the list of its files with their hashes.
-
-    `packed` is the opened archive, and `top` its only folder. The size is checked first, because an
-    archive of unknown origin could contain a manifest that fills the memory.
-
-    Raises:
-        InputError: the manifest is too large, or does not follow its schema.
-    """
-    entry = packed.getinfo(f"{top}/{MANIFEST_FILE}")
-    if entry.file_size > _MAX_MANIFEST_BYTES:
-        raise _make_refusal(archive, f"{MANIFEST_FILE} has {entry.file_size} bytes")
-    try:
-        manifest = json.loads(packed.read(entry))
-    except (ValueError, RecursionError):
-        manifest = None
-    if violations := find_violations(manifest, "manifest"):
-        raise InputError(f"{archive}: {MANIFEST_FILE}: {violations[0]}")
-    checked: dict[str, Any] = manifest
-    return checked
-
-
-def _compare_with_manifest(
-    manifest: dict[str, Any], unpacked: Mapping[str, tuple[int, str]]
-) -> Iterator[VerificationFailure]:
-    """Yield files that are missing, added, or different from the manifest.
-
-    Args:
-        manifest: content of the manifest.
-        unpacked: size in bytes and SHA-256 of each unpacked file, by path.
-    """
-    listed_files = {
-        listed_file["path"]: (listed_file["bytes"], listed_file["sha256"])
-        for listed_file in manifest["files"]
-    }
-    if len(listed_files) < len(manifest["files"]):
-        yield VerificationFailure(
-            MANIFEST_FILE, 0, "expected each file once, found one listed twice"
-        )
-    for path in sorted({*listed_files, *unpacked}):
-        if path not in unpacked:
-            yield VerificationFailure(path, 0, "expected it, as the manifest lists it; found none")
-        elif path not in listed_files:
-            yield VerificationFailure(
-                path, 0, "expected no file that the manifest does not list; found this one"
-            )
-        elif listed_files[path] != unpacked[path]:
-            (size, digest), (found_size, found_digest) = listed_files[path], unpacked[path]
-            expected = f"{size} bytes with SHA-256 {digest[:12]}"
-            yield VerificationFailure(
-                path, 0, f"expected {expected}, found {found_size} bytes with {found_digest[:12]}"
-            )
-
-
-_FORMAT_VERSION = 1
-"""Version of the manifest's format."""
-_PLUGIN_FOLDER = "plugins"
-"""Folder of plugin files in the archive of a comparison."""
 
 
 class BundleResult(NamedTuple):
@@ -442,14 +192,20 @@ def _list_plugin_files(folder: Path) -> dict[str, Path]:
     return files
 
 
-def _list_comparison_folders(folder: Path) -> Iterator[Path]:
-    """Yield the folders of the comparisons in a folder.
+def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
+    """List recordings for the archive: each CSV table, and its TOML description if it exists.
 
-    A misspecification study consists of two comparisons, in subfolders of its own folder.
+    Returns:
+        Files on this machine, by their path in the archive.
     """
-    for part in list_study_folders(folder):
-        models = [part / label for label in MODEL_LABELS if (part / label).is_dir()]
-        yield from models or [part]
+    files = {}
+    for table in tables:
+        if not table.is_file():
+            raise InputError(f"{table}: no such file")
+        for path in (table, table.with_suffix(".toml")):
+            if path.is_file():
+                files[f"{RECORDINGS_FOLDER}/{path.name}"] = path
+    return files
 
 
 def _format_compare_command(folder: Path, name: str) -> str:
@@ -474,145 +230,215 @@ def _format_compare_command(folder: Path, name: str) -> str:
     return " ".join(["simgap compare suite", *plugins, f"--tuners {tuners}"])
 
 
-def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
-    """List recordings for the archive: each CSV table, and its TOML description if it exists.
-
-    Returns:
-        Files on this machine, by their path in the archive.
-    """
-    files = {}
-    for table in tables:
-        if not table.is_file():
-            raise InputError(f"{table}: no such file")
-        for path in (table, table.with_suffix(".toml")):
-            if path.is_file():
-                files[f"{RECORDINGS_FOLDER}/{path.name}"] = path
-    return files
-
-
-class Verification(NamedTuple):
-    """Result of verifying a folder of results, or an archive of one.
-
-    Attributes:
-        comparisons: result for each comparison in it.
-        explanation: result for the explanation in it.
-        archive: metadata of the archive; None for a folder.
-        doubts: files of the archive that differ from its manifest; if there are any, nothing else
-            is verified.
-    """
-
-    comparisons: list[VerificationResult]
-    explanation: ExplanationVerification | None
-    archive: dict[str, Any] | None = None
-    doubts: Sequence[VerificationFailure] = ()
-
-    @property
-    def is_consistent(self) -> bool:
-        """True if there is no verification failure."""
-        has_no_doubts = not self.doubts and all(part.is_consistent for part in self.comparisons)
-        return has_no_doubts and not (self.explanation and self.explanation.doubts)
-
-    def to_document(self) -> dict[str, Any]:
-        """Convert the result to a JSON document."""
-        archive = self.archive
-        if archive is not None:
-            archive = {**archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
-        return {
-            "follows": self.is_consistent,
-            "archive": archive,
-            "comparisons": [part.to_document() for part in self.comparisons],
-            "explanation": self.explanation.to_document() if self.explanation else None,
-        }
-
-
-def verify_results(
-    path: Path, print_line: PrintLine, plugins: Sequence[str] = (), every: bool = False
-) -> Verification:
-    """Verify the results in a folder or in an archive, which must match its manifest.
+def write_archive(
+    archive: Path, name: str, files: Mapping[str, Path], metadata: Mapping[str, Any]
+) -> None:
+    """Write an archive completely or not at all.
 
     Args:
-        path: folder of a comparison, a sweep or an explanation, or archive of `write_bundle`.
-        print_line: prints a line.
-        plugins: plugin files to load; those that an archive names or contains are never run.
-        every: whether to repeat every simulation instead of a sample.
+        archive: Path of a new file.
+        name: Name of the folder in the archive.
+        files: Path of each file on disk, by its path in that folder.
+        metadata: Entries of the manifest in addition to the files.
 
     Raises:
-        InputError: the path has no results, or an archive is unsafe to unpack.
+        InputError: The archive exists already, or a file cannot be read or written.
     """
-    if path.is_file():
-        with unpack_archive(path) as unpacked:
-            return _verify_archive(path, unpacked, print_line, plugins, every)
-    if (path / VERDICT_FILE).is_file():
-        return Verification([], _verify_explanation(path, path, print_line))
-    folders = list_study_folders(path)
-    return Verification([verify_comparison(f, print_line, plugins, every) for f in folders], None)
-
-
-def _verify_archive(
-    archive: Path,
-    unpacked: UnpackedArchive,
-    print_line: PrintLine,
-    plugins: Sequence[str],
-    every: bool,
-) -> Verification:
-    """Verify that an archive matches its manifest, and verify the results in it.
-
-    Args:
-        archive: archive, possibly written elsewhere.
-        unpacked: its content.
-        print_line: prints a line.
-        plugins: plugin files to load.
-        every: whether to repeat every simulation instead of a sample.
-
-    Returns:
-        The result; without results of its content if files differ from the manifest.
-    """
-    description = _describe_archive(archive, unpacked)
-    count, size = description["files"], description["bytes"]
-    print_line(
-        f"{archive}: {description['kind']} of simgap {description['simgap']}, {count} files, "
-        f"{size} bytes"
-    )
-    if unpacked.mismatches:
-        print_failures(unpacked.mismatches, archive, print_line)
-        return Verification([], None, description, unpacked.mismatches)
-    print_line(
-        f"{MANIFEST_FILE}: every listed file exists with its SHA-256, and there are no others"
-    )
-    if description["kind"] == "explanation":
-        explanation = _verify_explanation(unpacked.folder, archive, print_line)
-        return Verification([], explanation, description)
-    # The plugins that the archive contains are not run. Results are named by their path in the
-    # archive, and not in the temporary folder.
-    comparisons = [
-        verify_comparison(part, print_line, plugins, every, own_plugins=False)._replace(
-            folder=archive / part.relative_to(unpacked.folder.parent)
-        )
-        for part in _list_comparison_folders(unpacked.folder)
+    if archive.exists():
+        raise InputError(f"{archive}: exists already; name another file with --out")
+    file_entries = [
+        {"path": path, "bytes": file.stat().st_size, "sha256": compute_sha256(file)}
+        for path, file in sorted(files.items())
     ]
-    return Verification(comparisons, None, description)
+    manifest = json.dumps({**metadata, "files": file_entries}, indent=1, ensure_ascii=False) + "\n"
+    try:
+        archive.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_replacement(archive) as partial, zipfile.ZipFile(partial, "w") as packed:
+            packed.writestr(
+                _make_zip_header(f"{name}/{MANIFEST_FILE}"),
+                manifest,
+                compress_type=zipfile.ZIP_DEFLATED,
+                compresslevel=9,
+            )
+            for path, file in sorted(files.items()):
+                with (
+                    file.open("rb") as source,
+                    packed.open(_make_zip_header(f"{name}/{path}"), "w") as target,
+                ):
+                    shutil.copyfileobj(source, target, _BLOCK_BYTES)
+    except OSError as error:
+        raise InputError(f"{archive}: cannot be written ({error.strerror})") from None
 
 
-def _verify_explanation(folder: Path, name: Path, print_line: PrintLine) -> ExplanationVerification:
-    """Verify an explanation, and print its failures; `name` is its folder or archive in them."""
-    verification = verify_extended_model(folder, print_line)
-    print_failures(verification.doubts, name, print_line)
-    return verification
+def _make_zip_header(path: str) -> zipfile.ZipInfo:
+    """Make the header of a file in the zip archive, with fixed time, permissions and system.
+
+    The bytes of the archive then depend on the content of the files only.
+    """
+    entry = zipfile.ZipInfo(path, _ZIP_EPOCH)
+    entry.create_system = 3  # Always Unix, so that the bytes do not depend on this machine.
+    entry.external_attr = (stat.S_IFREG | 0o644) << 16
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    return entry
 
 
-def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any]:
-    """Return what the manifest says about an archive, as the beginning of the JSON document.
+class UnpackedArchive(NamedTuple):
+    """An archive that has been unpacked.
+
+    Attributes:
+        folder: Temporary folder with its content.
+        manifest: Its manifest.
+        files: Size in bytes and SHA-256 of each file by path, without the manifest.
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+    files: dict[str, tuple[int, str]]
+
+
+@contextmanager
+def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
+    """Context that unpacks an archive into a temporary folder.
 
     Args:
-        archive: path of the archive.
-        unpacked: its content.
+        archive: path of the archive, which may be of unknown origin.
+
+    Yields:
+        The folder, which is deleted afterwards, the manifest, and the files with their hashes.
+
+    Raises:
+        InputError: It is not an archive of simgap, or unpacking it could be harmful.
     """
-    manifest = unpacked.manifest
-    return {
-        "file": archive,
-        "kind": manifest["kind"],
-        "files": len(manifest["files"]),
-        "bytes": sum(listed_file["bytes"] for listed_file in manifest["files"]),
-        "simgap": manifest["simgap"],
-        "command": manifest["command"],
-    }
+    try:
+        with zipfile.ZipFile(archive) as packed, TemporaryDirectory(prefix="simgap-") as folder:
+            entries = _check_entries(archive, packed)
+            top_folder = _find_top_folder(archive, entries)
+            manifest = _read_manifest(archive, packed, top_folder)
+            sizes_and_hashes = {}
+            for entry in entries:
+                path = Path(folder, *PurePosixPath(entry.filename).parts)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                # No more bytes are read than the entry states, however many it contains.
+                with packed.open(entry) as source, path.open("wb") as target:
+                    shutil.copyfileobj(source, target, _BLOCK_BYTES)
+                name = entry.filename.removeprefix(f"{top_folder}/")
+                sizes_and_hashes[name] = path.stat().st_size, compute_sha256(path)
+            # The manifest does not list itself.
+            del sizes_and_hashes[MANIFEST_FILE]
+            yield UnpackedArchive(Path(folder, top_folder), manifest, sizes_and_hashes)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError) as error:
+        raise InputError(f"{archive}: expected an archive of simgap bundle; {error}") from None
+    except OSError as error:
+        raise InputError(f"{archive}: cannot be read ({error.strerror or error})") from None
+
+
+def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
+    """Return the entries of an archive if all of them can be unpacked safely.
+
+    Args:
+        archive: path of the archive, for messages.
+        packed: archive, open for reading.
+
+    Raises:
+        InputError: One cannot.
+    """
+    entries = packed.infolist()
+    if len(entries) > _MAX_FILES:
+        raise _make_refusal(archive, f"{len(entries)} files, at most {_MAX_FILES} expected")
+    for member in entries:
+        if problem := _find_entry_error(member):
+            raise _make_refusal(archive, f"{member.filename[:80]!r} {problem}")
+    # Two names that a file system treats as equal would overwrite each other's file.
+    repeated_names = [
+        name for name, n in Counter(e.filename.casefold() for e in entries).items() if n > 1
+    ]
+    if repeated_names:
+        raise _make_refusal(archive, f"{repeated_names[0]!r} is in it twice")
+    total, size = sum(member.file_size for member in entries), archive.stat().st_size
+    if total > MAX_UNPACKED_BYTES or (
+        total > _MIN_BYTES_FOR_RATIO_CHECK and total > MAX_COMPRESSION_RATIO * size
+    ):
+        raise _make_refusal(archive, f"it would unpack from {size} bytes to {total}")
+    # Such data are a comment at the end, or bytes before the first file.
+    if packed.comment or min((e.header_offset for e in entries), default=0) > 0:
+        raise _make_refusal(archive, "it contains data that belong to no file")
+    return entries
+
+
+def _find_entry_error(entry: zipfile.ZipInfo) -> str:
+    """Return why an entry of an archive must not be unpacked; empty if it may be.
+
+    An archive of unknown origin could contain paths outside its folder, links or devices, which
+    would overwrite files of the user.
+    """
+    name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
+    parts = name.split("/")
+    # If the two stored names of an entry differ, programs would unpack it to different paths.
+    if name != entry.orig_filename or "\\" in name or ":" in name or not name.isprintable():
+        return "is not a plain path"
+    if len(name) > _MAX_PATH_LENGTH or any(part in ("", ".", "..") for part in parts):
+        return "is not a path inside its folder"
+    if kind not in (0, stat.S_IFREG) or entry.is_dir():
+        return "is a link, a folder or a device; expected a file"
+    if entry.flag_bits & _ENCRYPTED_FLAG:
+        return "is encrypted"
+    if entry.compress_type not in _COMPRESSION_METHODS:
+        return "is compressed in a way that simgap does not use"
+    return ""
+
+
+def _make_refusal(archive: Path, reason: str) -> InputError:
+    return InputError(f"{archive}: refused: {reason}; nothing was unpacked")
+
+
+def _find_top_folder(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
+    """Return the single top-level folder of an archive, which contains the manifest.
+
+    Args:
+        archive: path of the archive, for messages.
+        entries: its entries.
+
+    Raises:
+        InputError: the archive has another form, so it was not made by `simgap bundle`.
+    """
+    paths = {entry.filename for entry in entries}
+    top_folders = {path.partition("/")[0] for path in paths}
+    if len(top_folders) == 1:
+        (top_folder,) = top_folders
+        if f"{top_folder}/{MANIFEST_FILE}" in paths:
+            return top_folder
+    raise InputError(
+        f"{archive}: expected an archive of simgap bundle: one folder with {MANIFEST_FILE} in it"
+    )
+
+
+def _read_manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any]:
+    """Read and validate the manifest of an archive, the list of its files with their hashes.
+
+    `packed` is the opened archive, and `top` its only folder. The size is checked first, because an
+    archive of unknown origin could contain a manifest that fills the memory.
+
+    Raises:
+        InputError: the manifest is too large, or does not follow its schema.
+    """
+    entry = packed.getinfo(f"{top}/{MANIFEST_FILE}")
+    if entry.file_size > _MAX_MANIFEST_BYTES:
+        raise _make_refusal(archive, f"{MANIFEST_FILE} has {entry.file_size} bytes")
+    try:
+        manifest = json.loads(packed.read(entry))
+    except (ValueError, RecursionError):
+        manifest = None
+    if violations := find_violations(manifest, "manifest"):
+        raise InputError(f"{archive}: {MANIFEST_FILE}: {violations[0]}")
+    checked: dict[str, Any] = manifest
+    return checked
+
+
+def list_comparison_folders(folder: Path) -> Iterator[Path]:
+    """Yield the folders of the comparisons in a folder.
+
+    A misspecification study consists of two comparisons, in subfolders of its own folder.
+    """
+    for part in list_study_folders(folder):
+        models = [part / label for label in MODEL_LABELS if (part / label).is_dir()]
+        yield from models or [part]

@@ -1,9 +1,9 @@
-"""Verify that a finished comparison is consistent.
+"""Verify that results are consistent (`simgap verify`): a comparison, an explanation or an archive.
 
-Its targets must follow from the salt that was committed before the first run, its errors from its
-targets, its losses from its proposals, and its tables from its rows.
-
-Verify that the files of an explanation are valid and consistent (`simgap verify`).
+The targets of a finished comparison must follow from the salt that was committed before the first
+run, its errors from its targets, its losses from its proposals, and its tables from its rows. The
+files of an explanation must be valid and agree with each other. An archive must also match its
+manifest.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from bench.benchmark.problem.experiment_config import Experiment
-from bench.benchmark.problem.targets import Target
+from bench.benchmark.problem.targets import Target, draw_targets
 from bench.benchmark.problem.tuning_problem import (
     ProposalEvaluator,
     TuningProblem,
@@ -37,6 +37,14 @@ from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
 from bench.core.plugin_registries import simulators
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.verdict import VERDICT_FILE, InvalidVerdictError, Verdict, read_verdict
+from bench.studies.archive_bundle import (
+    MANIFEST_FILE,
+    RECORDINGS_FOLDER,
+    UnpackedArchive,
+    list_comparison_folders,
+    unpack_archive,
+)
+from bench.studies.study_kinds import list_study_folders
 from sims.core.simulator import Array, InputError
 from sims.extended_simulator import EXTENDED_MODEL_FILE, ExtendedSimulator, open_extended
 
@@ -49,6 +57,13 @@ _ARITHMETIC_TOLERANCE = 1e-9
 """Relative tolerance of numbers that arithmetic alone determines."""
 _SIMULATION_TOLERANCE = 1e-6
 """Relative tolerance of simulated numbers, possibly from another machine."""
+_HELD_OUT_ERROR_TOLERANCE = 1e-3
+"""Relative tolerance of a held-out error.
+
+Initial states are estimated again, possibly on another machine.
+"""
+_NUMBER_TOLERANCE = 1e-9
+"""Relative difference up to which numbers of verdict and extended model are equal."""
 
 
 class VerificationFailure(NamedTuple):
@@ -68,7 +83,184 @@ class VerificationFailure(NamedTuple):
         return f"{self.file}{f', row {self.row}' if self.row else ''}: {self.says}"
 
 
-class VerificationResult(NamedTuple):
+class Verification(NamedTuple):
+    """Result of verifying a folder of results, or an archive of one.
+
+    Attributes:
+        comparisons: result for each comparison in it.
+        explanation: result for the explanation in it.
+        archive: metadata of the archive; None for a folder.
+        doubts: files of the archive that differ from its manifest; if there are any, nothing else
+            is verified.
+    """
+
+    comparisons: list[ComparisonVerification]
+    explanation: ExplanationVerification | None
+    archive: dict[str, Any] | None = None
+    doubts: Sequence[VerificationFailure] = ()
+
+    @property
+    def is_consistent(self) -> bool:
+        """True if there is no verification failure."""
+        has_no_doubts = not self.doubts and all(part.is_consistent for part in self.comparisons)
+        return has_no_doubts and not (self.explanation and self.explanation.doubts)
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert the result to a JSON document."""
+        archive = self.archive
+        if archive is not None:
+            archive = {**archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
+        return {
+            "follows": self.is_consistent,
+            "archive": archive,
+            "comparisons": [part.to_document() for part in self.comparisons],
+            "explanation": self.explanation.to_document() if self.explanation else None,
+        }
+
+
+def verify_results(
+    path: Path, print_line: PrintLine, plugins: Sequence[str] = (), every: bool = False
+) -> Verification:
+    """Verify the results in a folder or in an archive, which must match its manifest.
+
+    Args:
+        path: folder of a comparison, a sweep or an explanation, or archive of `write_bundle`.
+        print_line: prints a line.
+        plugins: plugin files to load; those that an archive names or contains are never run.
+        every: whether to repeat every simulation instead of a sample.
+
+    Raises:
+        InputError: the path has no results, or an archive is unsafe to unpack.
+    """
+    if path.is_file():
+        with unpack_archive(path) as unpacked:
+            return _verify_archive(path, unpacked, print_line, plugins, every)
+    if (path / VERDICT_FILE).is_file():
+        return Verification([], _verify_explanation(path, path, print_line))
+    folders = list_study_folders(path)
+    return Verification([verify_comparison(f, print_line, plugins, every) for f in folders], None)
+
+
+def _verify_archive(
+    archive: Path,
+    unpacked: UnpackedArchive,
+    print_line: PrintLine,
+    plugins: Sequence[str],
+    every: bool,
+) -> Verification:
+    """Verify that an archive matches its manifest, and verify the results in it.
+
+    Args:
+        archive: archive, possibly written elsewhere.
+        unpacked: its content.
+        print_line: prints a line.
+        plugins: plugin files to load.
+        every: whether to repeat every simulation instead of a sample.
+
+    Returns:
+        The result; without results of its content if files differ from the manifest.
+    """
+    description = _describe_archive(archive, unpacked)
+    count, size = description["files"], description["bytes"]
+    print_line(
+        f"{archive}: {description['kind']} of simgap {description['simgap']}, {count} files, "
+        f"{size} bytes"
+    )
+    mismatches = list(_compare_with_manifest(unpacked.manifest, unpacked.files))
+    if mismatches:
+        print_failures(mismatches, archive, print_line)
+        return Verification([], None, description, mismatches)
+    print_line(
+        f"{MANIFEST_FILE}: every listed file exists with its SHA-256, and there are no others"
+    )
+    if description["kind"] == "explanation":
+        explanation = _verify_explanation(unpacked.folder, archive, print_line)
+        return Verification([], explanation, description)
+    # The plugins that the archive contains are not run. Results are named by their path in the
+    # archive, and not in the temporary folder.
+    comparisons = [
+        verify_comparison(part, print_line, plugins, every, own_plugins=False)._replace(
+            folder=archive / part.relative_to(unpacked.folder.parent)
+        )
+        for part in list_comparison_folders(unpacked.folder)
+    ]
+    return Verification(comparisons, None, description)
+
+
+def _compare_with_manifest(
+    manifest: dict[str, Any], unpacked: Mapping[str, tuple[int, str]]
+) -> Iterator[VerificationFailure]:
+    """Yield files that are missing, added, or different from the manifest.
+
+    Args:
+        manifest: content of the manifest.
+        unpacked: size in bytes and SHA-256 of each unpacked file, by path.
+    """
+    listed_files = {
+        listed_file["path"]: (listed_file["bytes"], listed_file["sha256"])
+        for listed_file in manifest["files"]
+    }
+    if len(listed_files) < len(manifest["files"]):
+        yield VerificationFailure(
+            MANIFEST_FILE, 0, "expected each file once, found one listed twice"
+        )
+    for path in sorted({*listed_files, *unpacked}):
+        if path not in unpacked:
+            yield VerificationFailure(path, 0, "expected it, as the manifest lists it; found none")
+        elif path not in listed_files:
+            yield VerificationFailure(
+                path, 0, "expected no file that the manifest does not list; found this one"
+            )
+        elif listed_files[path] != unpacked[path]:
+            (size, digest), (found_size, found_digest) = listed_files[path], unpacked[path]
+            expected = f"{size} bytes with SHA-256 {digest[:12]}"
+            yield VerificationFailure(
+                path, 0, f"expected {expected}, found {found_size} bytes with {found_digest[:12]}"
+            )
+
+
+def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any]:
+    """Return what the manifest says about an archive, as the beginning of the JSON document.
+
+    Args:
+        archive: path of the archive.
+        unpacked: its content.
+    """
+    manifest = unpacked.manifest
+    return {
+        "file": archive,
+        "kind": manifest["kind"],
+        "files": len(manifest["files"]),
+        "bytes": sum(listed_file["bytes"] for listed_file in manifest["files"]),
+        "simgap": manifest["simgap"],
+        "command": manifest["command"],
+    }
+
+
+def _verify_explanation(folder: Path, name: Path, print_line: PrintLine) -> ExplanationVerification:
+    """Verify an explanation, and print its failures; `name` is its folder or archive in them."""
+    verification = verify_extended_model(folder, print_line)
+    print_failures(verification.doubts, name, print_line)
+    return verification
+
+
+def print_failures(
+    doubts: Sequence[VerificationFailure], folder: Path, print_line: PrintLine
+) -> None:
+    """Print verification failures, at most `_MAX_PRINTED_FAILURES` of them, and their number.
+
+    Args:
+        doubts: files and rows that do not follow from others.
+        folder: folder of the results.
+        print_line: prints one line of text.
+    """
+    for doubt in doubts[:_MAX_PRINTED_FAILURES]:
+        print_line(f"NOT REPRODUCED  {folder}/{doubt}")
+    if len(doubts) > _MAX_PRINTED_FAILURES:
+        print_line(f"and {len(doubts) - _MAX_PRINTED_FAILURES} more")
+
+
+class ComparisonVerification(NamedTuple):
     """Result of verifying a comparison.
 
     Attributes:
@@ -104,7 +296,7 @@ def verify_comparison(
     plugins: Sequence[str] = (),
     every: bool = False,
     own_plugins: bool = True,
-) -> VerificationResult:
+) -> ComparisonVerification:
     """Verify a finished comparison, and print the result.
 
     The salt, from which the targets were drawn, must be the one that was committed by its hash
@@ -152,23 +344,7 @@ def verify_comparison(
     print_failures(doubts, folder, print_line)
     if not doubts:
         print_line("all results are reproducible")
-    return VerificationResult(folder, tuple(checks), tuple(doubts))
-
-
-def print_failures(
-    doubts: Sequence[VerificationFailure], folder: Path, print_line: PrintLine
-) -> None:
-    """Print verification failures, at most `_MAX_PRINTED_FAILURES` of them, and their number.
-
-    Args:
-        doubts: files and rows that do not follow from others.
-        folder: folder of the results.
-        print_line: prints one line of text.
-    """
-    for doubt in doubts[:_MAX_PRINTED_FAILURES]:
-        print_line(f"NOT REPRODUCED  {folder}/{doubt}")
-    if len(doubts) > _MAX_PRINTED_FAILURES:
-        print_line(f"and {len(doubts) - _MAX_PRINTED_FAILURES} more")
+    return ComparisonVerification(folder, tuple(checks), tuple(doubts))
 
 
 def _describe_salt(experiment: Experiment) -> str:
@@ -198,7 +374,7 @@ def _verify_runs_table(
         print_line: prints one line of text.
         is_every_row: whether losses are simulated again in all rows, and not in a selection.
     """
-    targets = {target.blinded.name: target for target in problem.draw_targets()}
+    targets = {target.blinded.name: target for target in draw_targets(problem)}
     runs = stored.runs
     doubts = [
         VerificationFailure(
@@ -245,7 +421,9 @@ def _verify_errors(
     errors = np.abs(recommended - target.truth)
     expected = {f"true_{name}": np.full(len(rows), target.truth[i]) for i, name in enumerate(names)}
     expected["param_error"] = (errors / problem.cube.compute_training_widths()).mean(axis=1)
-    expected["outside"] = np.full(len(rows), problem.compute_distance_from_training(target.truth))
+    expected["outside"] = np.full(
+        len(rows), problem.cube.compute_distance_from_training(target.truth)
+    )
     if len(names) == 1:
         expected["param_abs_error"] = errors[:, 0]
     for column, values in expected.items():
@@ -415,15 +593,6 @@ def _compare_columns(expected: pd.Series, found: pd.Series) -> NDArray[np.bool_]
     return is_equal
 
 
-_ERROR_TOLERANCE = 1e-3
-"""Relative tolerance of a held-out error.
-
-Initial states are estimated again, possibly on another machine.
-"""
-RELATIVE_TOLERANCE = 1e-9
-"""Relative difference up to which two numbers of the files are equal."""
-
-
 class ExplanationVerification(NamedTuple):
     """Result of verifying an explanation.
 
@@ -508,7 +677,7 @@ def _find_differing_numbers(
     for name, fitted_value in verdict.parameters.items():
         model_value = extended.parameters.get(name)
         if model_value is not None and not math.isclose(
-            fitted_value.value, model_value.value, rel_tol=RELATIVE_TOLERANCE
+            fitted_value.value, model_value.value, rel_tol=_NUMBER_TOLERANCE
         ):
             yield VerificationFailure(
                 VERDICT_FILE,
@@ -521,7 +690,7 @@ def _find_differing_numbers(
         for name, fitted_value in cause.coefficients.items():
             # A missing number is NaN, which is close to no number.
             value = coefficients[name].value if name in coefficients else math.nan
-            if not math.isclose(fitted_value.value, value, rel_tol=RELATIVE_TOLERANCE):
+            if not math.isclose(fitted_value.value, value, rel_tol=_NUMBER_TOLERANCE):
                 label = f"{cause.effect} {name}"
                 yield VerificationFailure(
                     VERDICT_FILE,
@@ -536,7 +705,8 @@ def _score_extended_model(
     """Repeat the held-out error of the extended simulator, if the folder has the recording.
 
     Nothing can be repeated without a stated error or without the recording; the recording must have
-    the hash that the explanation states. A difference beyond `_ERROR_TOLERANCE` is a failure.
+    the hash that the explanation states. A difference beyond `_HELD_OUT_ERROR_TOLERANCE` is a
+    failure.
 
     Args:
         folder: folder of the explanation.
@@ -568,7 +738,7 @@ def _score_extended_model(
     assert verdict.heldout is not None  # because it states an error
     repeated_error = _combine_errors(result["rmse"], result["units"], verdict.heldout.unit)
     # NaN, which means that no channel has the unit, also counts as a difference.
-    if not math.isclose(stated_error, repeated_error, rel_tol=_ERROR_TOLERANCE):
+    if not math.isclose(stated_error, repeated_error, rel_tol=_HELD_OUT_ERROR_TOLERANCE):
         difference = (
             f"rmse_extended on held-out runs: {stated_error:.6g}, recomputed {repeated_error:.6g}"
         )
@@ -618,7 +788,3 @@ def _combine_errors(
     if not errors:
         return math.nan
     return math.sqrt(sum(error * error for error in errors) / len(errors))
-
-
-RECORDINGS_FOLDER = "recordings"
-"""Folder of recordings in the archive of an explanation."""

@@ -1,7 +1,8 @@
-"""Studies in result folders: the interface, and the choice of the kind of study.
+"""Choose the kind of study of an experiment or result folder; begin, resume and open studies.
 
 Comparisons of tuners, comparisons of diagnosers, bounce shots and studies of a missing effect
-implement the same interface. Only this module decides which of them an experiment describes.
+implement the interface of `bench.benchmark.runner.study_base.Study`. Only this module decides which
+of them an experiment describes.
 """
 
 from __future__ import annotations

@@ -42,9 +42,7 @@ from sims.core.files import write_atomically
 from sims.core.simulator import Array, InputError
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
-
 
 _TEMPLATE = Path(__file__).with_name("multi_problem.html")
 _DIGITS = 7
@@ -273,6 +271,36 @@ class ComparisonCollection:
         return {t: np.mean([problem[t] for problem in distributions], axis=0) for t in self.tuners}
 
 
+def draw_critical_difference_figure(
+    ranked: pd.DataFrame, p_values: pd.DataFrame, friedman: float
+) -> Figure:
+    """Draw the critical-difference diagram: mean ranks over problems.
+
+    Bars join tuners that do not differ significantly at 5 %.
+
+    Args:
+        ranked: Ranks, one row per problem, one column per tuner.
+        p_values: P-values of Nemenyi's test of each pair of tuners.
+        friedman: P-value of Friedman's test.
+    """
+    from scikit_posthocs import critical_difference_diagram
+
+    # Width and height in inches, with the space for each tuner.
+    figure, axes = make_panel_grid(1, 1, (8.5, 1.6 + 0.28 * ranked.shape[1]))
+    axis = axes[0, 0]
+    # Each tuner has its colour of every other figure; text stays dark, since light colours are hard
+    # to read.
+    colours = {str(name): get_colour(index) for index, name in enumerate(ranked.columns)}
+    artists = critical_difference_diagram(
+        ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9}, color_palette=colours
+    )
+    for label in artists["labels"]:
+        label.set_color(NEUTRAL_MARK)
+    tests = f"Friedman p = {friedman:.2g}; bars: Nemenyi p > 0.05"
+    axis.set_title(f"Mean rank over {len(ranked)} problems, 1 is best ({tests})", fontsize=10)
+    return figure
+
+
 def _make_runtime_panel(
     styles: Mapping[str, MarkStyle], shares: Mapping[str, Array]
 ) -> tuple[Panel, pd.DataFrame]:
@@ -378,33 +406,3 @@ def render_multi_problem_page(
         error_panels=error_panels,
         rank_columns=[[name, "", 3] for name in collection.styles],
     )
-
-
-def draw_critical_difference_figure(
-    ranked: pd.DataFrame, p_values: pd.DataFrame, friedman: float
-) -> Figure:
-    """Draw the critical-difference diagram: mean ranks over problems.
-
-    Bars join tuners that do not differ significantly at 5 %.
-
-    Args:
-        ranked: Ranks, one row per problem, one column per tuner.
-        p_values: P-values of Nemenyi's test of each pair of tuners.
-        friedman: P-value of Friedman's test.
-    """
-    from scikit_posthocs import critical_difference_diagram
-
-    # Width and height in inches, with the space for each tuner.
-    figure, axes = make_panel_grid(1, 1, (8.5, 1.6 + 0.28 * ranked.shape[1]))
-    axis = axes[0, 0]
-    # Each tuner has its colour of every other figure; text stays dark, since light colours are hard
-    # to read.
-    colours = {str(name): get_colour(index) for index, name in enumerate(ranked.columns)}
-    artists = critical_difference_diagram(
-        ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9}, color_palette=colours
-    )
-    for label in artists["labels"]:
-        label.set_color(NEUTRAL_MARK)
-    tests = f"Friedman p = {friedman:.2g}; bars: Nemenyi p > 0.05"
-    axis.set_title(f"Mean rank over {len(ranked)} problems, 1 is best ({tests})", fontsize=10)
-    return figure

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from methods.tuner import Array
+from methods.learning.input_features import FeatureConfig
+from methods.tuner import Array, Task
 
 _ITERATIONS = 15
 """Number of iterations of reweighted least squares."""
@@ -32,6 +33,38 @@ _MIN_DENOMINATOR = 0.1
 
 A smaller one means that the pole of the map is near, where the motion reaches the camera.
 """
+
+
+def fill_target_gaps(
+    task: Task, simulated: Array, proposed: FeatureConfig, target: FeatureConfig
+) -> Array:
+    """Fill the gaps of the target's channels from a simulation, run by run.
+
+    This is done only if the proposed side of the network reads one channel of the simulation.
+
+    Shapes: T samples, C channels.
+
+    Args:
+        task: the task, with the observations of the target.
+        simulated: (T, C) a simulation.
+        proposed: configuration of the inputs of the proposed side, with its channels.
+        target: configuration of the inputs of the target's side, with its channels.
+
+    Returns:
+        (T, C) observations of the target; only the channels that the network reads are filled.
+    """
+    # Simulation and target may have different channels, such as a position and its pixels.
+    sensor = proposed.select_channels(simulated)
+    filled = task.observed.copy()
+    # With several channels of the simulation, the one that belongs to the sensor is not known.
+    if sensor.shape[-1] != 1:
+        return filled
+    run_ends = np.cumsum(task.lengths)
+    for first, end in zip(run_ends - task.lengths, run_ends, strict=True):
+        # Slices of the copy are filled in place.
+        for channel in target.select_channels(filled[first:end]).T:
+            channel[:] = fill_gaps(channel, sensor[first:end, 0])
+    return filled
 
 
 def fill_gaps(channel: Array, simulated: Array) -> Array:

@@ -1,33 +1,34 @@
-"""Input rows of the networks: features of the observation and of the scenario together.
+"""Input rows of the networks of learned tuners: features of an observation and of its scenario.
 
-Inputs of the networks of TuneNet and its regressor from an observation.
+Pure numpy, so that tuning needs no torch. `InputFeatures` joins both kinds of features.
 
-Pure numpy, so that tuning needs no torch. An observation (T, C) becomes a row of numbers in three
-steps: each run is resampled to a fixed number of points (RESAMPLE in Algorithm 1, arXiv
+Features of an observation (`ObservationFeatures`). An observation (T, C) becomes a row of numbers
+in three steps: each run is resampled to a fixed number of points (RESAMPLE in Algorithm 1, arXiv
 1907.11200); rates of change and sorted copies are added; each number is centred, and weighed by how
-faithfully it followed the parameters in training.
+reliably it followed the parameters in training.
 
 With x a number, d its parameters' differences from their mean within a scenario, and strictness s:
 
-    (1)  x - mean = d slopes + left over, by least squares in each scenario
-    (2)  faith of a parameter = e / (e + s * left over), e = |slope| * spread of the parameter
-    (3)  weight = (largest faith, each parameter's scaled to the same maximum)^2, per deviation
-    (4)  weight of circumstances = (b / (b + s * w))^2, per deviation, with b and w the standard
+    (1)  x - mean = d slopes + residual, by least squares in each scenario
+    (2)  reliability of a parameter = e / (e + s * residual), e = |slope| * spread of the parameter
+    (3)  weight = (largest reliability, scaled to the same maximum for each parameter)^2, per
+         deviation
+    (4)  weight for the scenario = (b / (b + s * w))^2, per deviation, with b and w the standard
          deviations between and within scenarios
 
-Features of scenarios: initial values, and how the observation responds to the inputs.
+Features of a scenario (`ScenarioFeatures`): initial values, and how the observation responds to the
+inputs. Each channel's acceleration is fitted by terms of the channels q and inputs u at the same
+time:
 
-Each channel's acceleration is fitted by terms of the channels q and inputs u at the same time:
-
-    (1)  q'' = k0 + k1 q + k3 q^3 + kf sense(q') + ku u + kd q'
+    (5)  q'' = k0 + k1 q + k3 q^3 + kf sign(q') + ku u + kd q'
 
 The fit is in weak form (D. Messenger, D. Bortz, Weak SINDy, Multiscale Model. Simul. 19, 2021,
 doi:10.1137/20M1343166): both sides are multiplied by a bump w that is zero at both ends, and
 integrated by parts, so that no noisy signal is differentiated twice:
 
-    (2)  integral of w q'' = integral of w'' q,   integral of w q' = -integral of w' q
+    (6)  integral of w q'' = integral of w'' q,   integral of w q' = -integral of w' q
 
-    (3)  w(s) = (1 - s^2)^4, s from -1 to 1 over the bump
+    (7)  w(s) = (1 - s^2)^4, s from -1 to 1 over the bump
 
 Initial values that no channel shows are inputs as they are. Input signals are not: appended to the
 observation they were measured to be worth next to nothing, since what a sample means depends on all
@@ -54,7 +55,31 @@ _ROUNDING_SHARE = 1e-9
 _MIN_DEVIATION_SHARE = 1e-3
 """Minimum deviation, as a share of the largest one; smaller ones are not scaled up further."""
 _MIN_DIVISOR = 1e-300
-"""Minimum divisor, so that zero divided by zero is finite."""
+"""Minimum divisor, so that zero divided by zero is finite, and a zero signal stays zero."""
+_BUMPS_PER_RUN = 12
+"""Number of bumps (7) that would fill a run without overlap.
+
+They overlap: successive bumps are shifted by an eighth of their width.
+"""
+_MIN_FITTED_SAMPLES = 7
+"""Minimum number of samples of a run for the fit of (5), for a bump of half width 3."""
+_SIGN_STEEPNESS = 10.0
+"""Factor in the smoothed sign: it saturates at a fraction of the mean rate of change."""
+_RIDGE_PARAMETER = 1e-6
+"""Ridge parameter of the fit of (5), per mean square of a regressor.
+
+With it, two collinear regressors, such as a constant input and 1, share a coefficient.
+"""
+_EQUALITY_TOLERANCE = 1e-9
+"""Relative difference below which numbers of two scenarios count as equal."""
+_STD_PER_MAD = 1.4826
+"""Standard deviations of a normal distribution per median absolute deviation."""
+_OBSERVATION_FEATURE_ARRAYS = ("chosen", "centre", "gain")
+"""Names of the arrays of `ObservationFeatures` that are stored."""
+_SCENARIO_FEATURE_ARRAYS = ("centre", "spread", "initial")
+"""Names of the arrays of `ScenarioFeatures` that are stored."""
+_MISSING_ARRAY = np.empty(0)
+"""Replacement of a missing array."""
 
 
 def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) -> Array:
@@ -326,31 +351,13 @@ def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array
     )
 
 
-_BUMPS_PER_RUN = 12
-"""Number of bumps that would fill a run without overlap.
-
-They overlap: successive bumps are shifted by an eighth of their width.
-"""
-_MIN_SAMPLES = 7
-"""Minimum number of samples of a run, for a bump of half width 3."""
-_SIGN_STEEPNESS = 10.0
-"""Factor in the smoothed sign: it saturates at a fraction of the mean rate of change."""
-_MIN_SIGNAL_DIVISOR = 1e-300
-"""Minimum divisor, so that a zero signal stays zero."""
-_RIDGE_PARAMETER = 1e-6
-"""Ridge parameter, per mean square of a regressor.
-
-With it, two collinear regressors, such as a constant input and 1, share a coefficient.
-"""
-
-
 def compute_response_coefficients(
     observations: Array, inputs: Array, lengths: tuple[int, ...]
 ) -> Array:
     """Fit an equation of motion to each run and channel, with time in samples.
 
     The acceleration of a channel is fitted by q'' = k0 + k1 q + k3 q^3 + kf sign(q') + ku u + kd q'
-    (1), with the terms of all channels q and inputs u, and a smoothed sign.
+    (5), with the terms of all channels q and inputs u, and a smoothed sign.
 
     Shapes: n observations, T samples, C channels, U inputs.
 
@@ -361,7 +368,7 @@ def compute_response_coefficients(
         lengths: number of samples of each run; a run of fewer than seven gives no coefficients.
 
     Returns:
-        (n, runs * C * (1 + 4 C + U)) coefficients: for each channel those of (1), with the terms of
+        (n, runs * C * (1 + 4 C + U)) coefficients: for each channel those of (5), with the terms of
         every channel.
     """
     coefficients = [np.empty((len(observations), 0))]
@@ -369,7 +376,7 @@ def compute_response_coefficients(
     for length in lengths:
         run = slice(first, first + length)
         first += length
-        if length < _MIN_SAMPLES:
+        if length < _MIN_FITTED_SAMPLES:
             continue
         # Resampling to the run's own length fills missing samples and changes nothing else.
         resampled = resample_runs(observations[:, run], (length,), length)
@@ -381,9 +388,9 @@ def compute_response_coefficients(
 def _compute_run_response(series: Array, inputs: Array) -> Array:
     """Compute the coefficients (n, C * R) of one run from series (n, T, C) and inputs (T, U).
 
-    Both sides of the equation of motion (1) of `compute_response_coefficients` are multiplied by a
+    Both sides of the equation of motion (5) of `compute_response_coefficients` are multiplied by a
     bump w, which is zero at both ends, and integrated, at many places of the run. By parts, the
-    integral of w q'' is that of w'' q, and the integral of w q' is minus that of w' q (2), so that
+    integral of w q'' is that of w'' q, and the integral of w q' is minus that of w' q (6), so that
     no noisy signal is differentiated. The result is a linear regression on R terms for each of n
     observations.
 
@@ -398,7 +405,7 @@ def _compute_run_response(series: Array, inputs: Array) -> Array:
     # Position in the bump, from -1 to 1, without its ends, where the bump is zero.
     s = np.arange(-half_width, half_width + 1) / (half_width + 1.0)
     parabola = 1 - s**2
-    bump = parabola**4
+    bump = parabola**4  # (7)
     # Derivatives w' and w'' of the bump, per sample.
     slope = -8 * s * parabola**3 / bump_width
     second_derivative = (48 * s**2 * parabola**2 - 8 * parabola**3) / bump_width**2
@@ -414,12 +421,12 @@ def _compute_run_response(series: Array, inputs: Array) -> Array:
     held_inputs = (inputs + earlier_inputs) / 2.0
     driven = np.broadcast_to(held_inputs, (len(series), *inputs.shape))
     constant = np.ones_like(driven[..., :1])
-    # All terms of (1) except the last one, which needs the derivative w'.
+    # All terms of (5) except the last one, which needs the derivative w'.
     signals = np.concatenate(
         [constant, series, series**3, _compute_smoothed_velocity_signs(series), driven], axis=2
     )
-    regressors = np.concatenate([integral(signals, bump), -integral(series, slope)], axis=2)  # (2)
-    accelerations = integral(series, second_derivative)  # (2)
+    regressors = np.concatenate([integral(signals, bump), -integral(series, slope)], axis=2)  # (6)
+    accelerations = integral(series, second_derivative)  # (6)
     return _fit_ridge_regression(regressors, accelerations).reshape(len(series), -1)
 
 
@@ -439,7 +446,7 @@ def _compute_smoothed_velocity_signs(series: Array) -> Array:
     line = offsets / (offsets**2).sum()
     padded = np.pad(series, ((0, 0), (3, 3), (0, 0)), mode="edge")
     rates = sliding_window_view(padded, len(offsets), axis=1) @ line
-    mean_rate = np.abs(rates).mean(axis=1, keepdims=True) + _MIN_SIGNAL_DIVISOR
+    mean_rate = np.abs(rates).mean(axis=1, keepdims=True) + _MIN_DIVISOR
     # tanh replaces the sign function, which would jump where noise crosses zero.
     return np.asarray(np.tanh(_SIGN_STEEPNESS * rates / mean_rate), dtype=np.float64)
 
@@ -454,7 +461,7 @@ def _fit_ridge_regression(regressors: Array, values: Array) -> Array:
         values: (n, J, C) right-hand sides of the J equations for each of C channels.
     """
     # Scaled to mean square 1, so that the ridge has the same effect on every regressor.
-    size = np.sqrt((regressors**2).mean(axis=1, keepdims=True)) + _MIN_SIGNAL_DIVISOR
+    size = np.sqrt((regressors**2).mean(axis=1, keepdims=True)) + _MIN_DIVISOR
     scaled = regressors / size
     transposed = scaled.transpose(0, 2, 1)
     count = scaled.shape[1]
@@ -462,12 +469,6 @@ def _fit_ridge_regression(regressors: Array, values: Array) -> Array:
     normal = transposed @ scaled / count + ridge
     coefficients = np.linalg.solve(normal, transposed @ values / count)
     return np.asarray(coefficients / size.transpose(0, 2, 1), dtype=np.float64)
-
-
-_EQUALITY_TOLERANCE = 1e-9
-"""Relative difference below which numbers count as equal."""
-_STD_PER_MAD = 1.4826
-"""Standard deviations of a normal distribution per median absolute deviation."""
 
 
 @dataclass(frozen=True)
@@ -583,14 +584,6 @@ def _differs_between_scenarios(numbers: Array) -> bool:
     return bool(np.any(np.ptp(numbers, axis=0) > _EQUALITY_TOLERANCE * sizes))
 
 
-_OBSERVATION_FEATURE_ARRAYS = ("chosen", "centre", "gain")
-"""Names of the arrays of `ObservationFeatures` that are stored."""
-_SCENARIO_FEATURE_ARRAYS = ("centre", "spread", "initial")
-"""Names of the arrays of `ScenarioFeatures` that are stored."""
-_MISSING_ARRAY = np.empty(0)
-"""Replacement of a missing array."""
-
-
 @dataclass(frozen=True)
 class FeatureConfig:
     """Configuration of network inputs and of the noise in training.
@@ -598,13 +591,13 @@ class FeatureConfig:
     Attributes:
         points: number of points to which each run is resampled; L in Algorithm 1.
         inputs: maximum number of inputs that are used from an observation.
-        strictness: see `methods.learning.input_features.make_weighted_features`.
+        strictness: see `make_weighted_features`.
         noise: sensor noise that a second network is trained with, as standard deviation in units of
             each channel's standard deviation in training; 0 for no second network.
         raw: True for the resampled series in SI units without weights, as published; the other
             settings then have no effect.
-        use_scenario_features: True to use scenario information too, if scenarios differ in it
-            (`methods.learning.input_features`).
+        use_scenario_features: True to use scenario information too, if scenarios differ in it; see
+            `ScenarioFeatures`.
         channels: indices of the first and the last channel that are used; None for all.
         clean: whether targets may be noise-free; if not, only the network for noisy targets is
             trained.

@@ -1,8 +1,11 @@
-"""The network of TuneNet: one branch for each of two observations, concatenated, fully connected.
+"""Pair network of TuneNet, its training, and the base class of the tuners that use it.
 
-Training uses torch (imported where it is needed); the forward pass used in tuning is plain numpy in
-double precision. Source: arXiv 1907.11200, section III and Eq. 1; layer sizes and training from the
-authors' released code.
+The network has one branch for each of two observations; the branches are concatenated and followed
+by fully connected layers. `train_pair_network` trains its weights with torch, which is imported
+where it is needed; the forward pass used in tuning, `estimate_difference`, is plain numpy in double
+precision. `TrainedPairNetwork` is the network with its input features, `PairTuner` the tuner.
+Source: arXiv 1907.11200, section III and Eq. 1; layer sizes and training from the authors' released
+code.
 
 With a and b the input rows of the proposed and the target side, u the units, [ ] concatenation:
 
@@ -11,8 +14,6 @@ With a and b the input rows of the proposed and the target side, u the units, [ 
     (3)  loss = mean |h - difference|^2 / (|difference|^2 + relative^2) + lambda |weights|^2
 
 Eq. 1 of the paper is (3) without the denominator: there the difference's size does not matter.
-
-Base class of tuners on TuneNet's pair network: training of the network, and its estimates.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from methods.learning.gap_filling import fill_gaps
+from methods.learning.gap_filling import fill_target_gaps
 from methods.learning.input_features import FeatureConfig, InputFeatures
 from methods.learning.network_training import (
     INITIAL_WEIGHT_LIMIT,
@@ -50,6 +51,8 @@ _LOSS_SCALE = 30.0
 """Divisor of relative squared errors; for Adam only their ratio to the penalty matters."""
 _LEARNING_RATE_DECAY = 0.99
 """Factor by which the published learning rate decreases in each epoch."""
+_PROPOSED_SIDE_PREFIX = "own-"
+"""Prefix of array names of the proposed side if both sides have different inputs."""
 
 
 @dataclass(frozen=True)
@@ -347,10 +350,6 @@ def _make_loss(
     return objective
 
 
-_PROPOSED_SIDE_PREFIX = "own-"
-"""Prefix of array names of the proposed side if both sides have different inputs."""
-
-
 @dataclass(frozen=True)
 class TrainedPairNetwork:
     """A trained pair network with its input features.
@@ -451,7 +450,9 @@ class TrainedPairNetwork:
             (proposed,) = self.proposed(observations, task.lengths, task.scene, hidden)
             target = row
             if target is None:
-                filled_target = _fill_target_gaps(task, observations[0], self)
+                filled_target = fill_target_gaps(
+                    task, observations[0], self.proposed.reading, self.features.reading
+                )
                 target = self.features(filled_target[None], task.lengths, task.scene)[0]
             return self.predict_difference(proposed, target)
 
@@ -515,40 +516,14 @@ def _compute_input_rows(
     return PairInputs(proposed_rows, rows)
 
 
-def _fill_target_gaps(task: Task, simulated: Array, network: TrainedPairNetwork) -> Array:
-    """Fill the gaps of the target (T, C) from a simulation (T, C), run by run.
-
-    This is done only if the network reads one channel of the simulation.
-
-    Shapes: T samples, C channels.
-
-    Args:
-        task: the task, with the observations of the target.
-        simulated: (T, C) a simulation.
-        network: network, with the channels that it compares.
-    """
-    # Simulation and target may have different channels, such as a position and its pixels.
-    sensor = network.proposed.reading.select_channels(simulated)
-    filled = task.observed.copy()
-    # With several channels of the simulation, the one that belongs to the sensor is not known.
-    if sensor.shape[-1] != 1:
-        return filled
-    run_ends = np.cumsum(task.lengths)
-    for first, end in zip(run_ends - task.lengths, run_ends, strict=True):
-        # Slices of the copy are filled in place.
-        for channel in network.features.reading.select_channels(filled[first:end]).T:
-            channel[:] = fill_gaps(channel, sensor[first:end, 0])
-    return filled
-
-
 class PairTuner(NoiseMatchedTuner[TrainedPairNetwork]):
-    """Base class of tuners on TuneNet's network.
+    """Base class of tuners on TuneNet's pair network.
 
     Subclasses define the design, the inputs and the tuning loop.
     """
 
     is_single_input: ClassVar[bool] = False
-    """True if the network has a single input, the target; see `pair_network.train`."""
+    """True if the network has a single input, the target; see `TrainedPairNetwork.train`."""
 
     def make_network_design(self) -> PairNetworkDesign:
         """Return the design of the network."""

@@ -1,4 +1,13 @@
-"""Quasi-random points that cover a space of parameters evenly."""
+"""Quasi-random points, which cover a space of parameters more evenly than random ones.
+
+An additive recurrence with the generalised golden ratio g (M. Roberts, The unreasonable
+effectiveness of quasirandom sequences, 2018), in d dimensions from the shift s:
+
+    g^(d + 1) = g + 1                                                                            (1)
+    x_nk = (s_k + n g^-k) mod 1,   n = 1, 2, ..., k = 1 ... d                                    (2)
+
+Scrambled Sobol points come from scipy.
+"""
 
 from __future__ import annotations
 
@@ -37,10 +46,19 @@ def generate_quasi_random_points(count: int, shift: Array) -> Array:
 
 
 def draw_sobol_points(rng: np.random.Generator, n: int, dim: int) -> Array:
-    """Return scrambled Sobol points (n, dim): quasi-random, evenly spread in the unit cube."""
+    """Draw scrambled Sobol points, which are evenly spread in the unit cube.
+
+    Args:
+        rng: random generator of the scrambling.
+        n: number of points; it need not be a power of two.
+        dim: number of dimensions.
+
+    Returns:
+        (n, dim) points.
+    """
     from scipy.stats import qmc
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # n need not be a power of two
+        warnings.simplefilter("ignore")  # scipy warns unless n is a power of two
         points: Array = qmc.Sobol(dim, seed=rng).random(n)
     return points

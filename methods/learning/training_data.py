@@ -1,11 +1,4 @@
-"""Training data of learned tuners: simulations at quasi-random parameters.
-
-An additive recurrence with the generalised golden ratio g (M. Roberts, The unreasonable
-effectiveness of quasirandom sequences, 2018), in d dimensions from the shift s:
-
-    g^(d + 1) = g + 1                                                                            (1)
-    x_nk = (s_k + n g^-k) mod 1,   n = 1, 2, ..., k = 1 ... d                                    (2)
-"""
+"""Training data of learned tuners: simulations at random parameters in several scenarios."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ whose minimiser, among candidates, is θ; the next simulation is where
 
     (1)  -P(θ) log P(θ)
 
-is largest. Candidates are quasi-random points (`methods.learning.training_data`).
+is largest. Candidates are quasi-random points (`methods.learning.quasi_random_points`).
 
 As published the candidates are a fixed grid, which bounds the accuracy, and the search stops when
 its estimate repeats, which is often too early. The default draws new candidates each time, dense

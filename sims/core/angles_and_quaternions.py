@@ -1,4 +1,4 @@
-"""Products of quaternions (w, x, y, z), and the yaw, pitch and roll that they stand for."""
+"""Quaternions (w, x, y, z), their yaw, pitch and roll, and angles recorded within one turn."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def compute_yaw_pitch_roll(quaternions: Array, reference: Array) -> Array:
     return result
 
 
-def unwrapped(positions: Array, command: Array | None = None) -> Array:
+def unwrap_angle(positions: Array, command: Array | None = None) -> Array:
     """Restore the whole turns of an angle that was recorded within one turn; NaN stays NaN.
 
     Jumps of more than half a turn between samples are removed. The first sample may still be off by

@@ -5,6 +5,9 @@ and nested dataclasses become documents. The metadata of a field change this:
 
 * `OPTIONAL`: the key is left out where the field has its default.
 * ``{"key": name}``: the key has another name than the field.
+
+`to_plain_values` resolves the dataclasses of a value. `to_json_value` converts everything else that
+JSON cannot represent, such as paths, NumPy arrays and NaN.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hin
 
 if TYPE_CHECKING:
     from typing import Self
+
 
 OPTIONAL: Mapping[str, Any] = {"optional": True}
 """Metadata of a field whose key is left out where the field has its default."""
@@ -53,6 +57,23 @@ def to_plain_values(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: to_plain_values(part) for key, part in value.items()}
     return [to_plain_values(part) for part in value] if isinstance(value, tuple | list) else value
+
+
+def to_json_value(value: Any) -> Any:
+    """Convert a value to JSON types: paths to text, tuples to lists, NaN and infinity to None."""
+    if isinstance(value, Mapping):
+        return {str(key): to_json_value(item) for key, item in value.items()}
+    if isinstance(value, tuple | list | set | frozenset):
+        return [to_json_value(item) for item in value]
+    if isinstance(value, PurePath):
+        return str(value)
+    # NumPy numbers and arrays have this method.
+    if hasattr(value, "tolist"):
+        return to_json_value(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    # Text from files or system calls may contain lone surrogates, which cannot be encoded.
+    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
 
 
 def _get_key(field: Field[Any]) -> str:
@@ -95,20 +116,3 @@ def _restore_dataclass(kind: Any, document: Mapping[str, Any]) -> Any:
         if (key := _get_key(field)) in document:
             values[field.name] = _restore(hints[field.name], document[key])
     return kind(**values)
-
-
-def to_json_value(value: Any) -> Any:
-    """Convert a value to JSON types: paths to text, tuples to lists, NaN and infinity to None."""
-    if isinstance(value, Mapping):
-        return {str(key): to_json_value(item) for key, item in value.items()}
-    if isinstance(value, tuple | list | set | frozenset):
-        return [to_json_value(item) for item in value]
-    if isinstance(value, PurePath):
-        return str(value)
-    # NumPy numbers and arrays have this method.
-    if hasattr(value, "tolist"):
-        return to_json_value(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    # Text from files or system calls may contain lone surrogates, which cannot be encoded.
-    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value

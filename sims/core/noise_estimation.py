@@ -1,4 +1,8 @@
-"""Estimate the noise of a sampled signal from the signal alone."""
+"""Estimate the noise of a sampled signal from the signal alone.
+
+`estimate_noise` uses differences of samples at any times, and recognises quantised signals.
+`estimate_roughness` fits cubics to windows of uniformly sampled signals.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +24,11 @@ _GAP_RATIO = 1.75
 A lost sample makes an interval twice as long.
 """
 
-_MIN_MOTION_SHARE = 1e-3
-"""Smallest motion per sample of a window for the noise estimate, as a share of the travel."""
-
 NOISE_WINDOW_SAMPLES = 9
-"""Length in samples of the windows for noise estimation; shorter paths are not smoothed."""
+"""Length in samples of the windows to which cubics are fitted; shorter signals are not smoothed."""
+
+_MIN_MOTION_SHARE = 1e-3
+"""Smallest motion per sample of a window that is evaluated, as a share of the travel."""
 
 
 class NoiseEstimate(NamedTuple):
@@ -114,21 +118,6 @@ def _compute_divided_differences(times: Array, values: Array, order: int) -> Arr
     return differences
 
 
-def _find_quantisation_step(runs: list[tuple[Array, Array]]) -> float:
-    """Return the smallest change of a signal that often does not change at all; 0 otherwise."""
-    changes = np.abs(np.concatenate([np.empty(0), *(np.diff(y) for _, y in runs)]))
-    # Computed values that should be equal may differ by rounding, so tiny changes count as none.
-    moving = changes[changes > 1e-12 * np.max(changes, initial=0.0)]
-    quantised = moving.size and np.mean(changes == 0) > _QUANTISED_SHARE
-    return float(moving.min()) if quantised else 0.0
-
-
-def count_gaps(times: Array) -> int:
-    """Count intervals that are much longer than the median interval."""
-    intervals = np.diff(times)
-    return int((intervals > _GAP_RATIO * np.median(intervals)).sum()) if intervals.size else 0
-
-
 def estimate_roughness(values: Array) -> float:
     """Estimate the noise of a signal from the residuals of local cubic fits.
 
@@ -161,3 +150,18 @@ def estimate_roughness(values: Array) -> float:
     residuals = windows - windows @ basis @ basis.T
     squares = (residuals**2).sum(axis=1)
     return float(np.sqrt(np.median(squares) / (NOISE_WINDOW_SAMPLES - 4)))
+
+
+def _find_quantisation_step(runs: list[tuple[Array, Array]]) -> float:
+    """Return the smallest change of a signal that often does not change at all; 0 otherwise."""
+    changes = np.abs(np.concatenate([np.empty(0), *(np.diff(y) for _, y in runs)]))
+    # Computed values that should be equal may differ by rounding, so tiny changes count as none.
+    moving = changes[changes > 1e-12 * np.max(changes, initial=0.0)]
+    quantised = moving.size and np.mean(changes == 0) > _QUANTISED_SHARE
+    return float(moving.min()) if quantised else 0.0
+
+
+def count_gaps(times: Array) -> int:
+    """Count intervals that are much longer than the median interval."""
+    intervals = np.diff(times)
+    return int((intervals > _GAP_RATIO * np.median(intervals)).sum()) if intervals.size else 0

@@ -27,6 +27,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+
 Source = Path | str
 Range = tuple[float, float]
 """Lower and upper end of a range."""
@@ -60,6 +61,21 @@ def toml_key(name: str) -> str:
     """
     characters = name.replace("_", "").replace("-", "")
     return name if characters.isascii() and characters.isalnum() else toml_text(name)
+
+
+def to_toml_value(value: Any) -> Any:
+    """Copy a value as plain dicts, lists and numbers, as TOML gives them.
+
+    NumPy numbers become Python numbers, tuples become lists, and keys become text.
+    """
+    # The command line imports this module, and starts faster without NumPy.
+    import numpy as np
+
+    if isinstance(value, Mapping):
+        return {str(key): to_toml_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_toml_value(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -441,18 +457,3 @@ def list_nested_names(tables: Mapping[str, Any]) -> list[str]:
         )
         names += [f"{name}.{inner}" for inner in list_nested_names(entry)] if nested else [name]
     return names
-
-
-def to_toml_value(value: Any) -> Any:
-    """Copy a value as plain dicts, lists and numbers, as TOML gives them.
-
-    NumPy numbers become Python numbers, tuples become lists, and keys become text.
-    """
-    # The command line imports this module, and starts faster without NumPy.
-    import numpy as np
-
-    if isinstance(value, Mapping):
-        return {str(key): to_toml_value(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_toml_value(item) for item in value]
-    return value.item() if isinstance(value, np.generic) else value

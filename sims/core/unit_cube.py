@@ -77,3 +77,17 @@ class UnitCube:
         """
         ranges = np.array([p.training_range for p in self.parameters], dtype=np.float64)
         return ranges[:, 1] - ranges[:, 0]
+
+    def compute_distance_from_training(self, theta: Array) -> float:
+        """Return the distance of parameters from the training range.
+
+        It is the largest distance of any parameter, in units of the width of the parameter's
+        training range; 0 inside.
+
+        Args:
+            theta: (dim,) parameters in their physical units.
+        """
+        ranges = np.array([p.training_range for p in self.parameters])
+        # One of the two differences is positive outside, both are negative inside.
+        excess = np.maximum(ranges[:, 0] - theta, theta - ranges[:, 1])
+        return float(max(0.0, (excess / self.compute_training_widths()).max()))

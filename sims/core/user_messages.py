@@ -1,32 +1,25 @@
-"""Plain Python values: their TOML and JSON forms, units as text, and largest plausible numbers.
-
-Larger values are mistakes, and would cause an overflow or an endless computation later.
-"""
+"""Texts of messages and tables: lists of names, counts, units, aligned columns, maximum lengths."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
 
+MAX_NAME_LENGTH = 120
+"""Maximum number of characters of a name or label, which is used in file names."""
+MAX_TITLE_LENGTH = 300
+"""Maximum number of characters of a title."""
+MAX_DESCRIPTION_LENGTH = 5000
+"""Maximum number of characters of a description."""
+MAX_MESSAGE_LENGTH = 4000
+"""Maximum number of characters of a message, because it may quote a large part of a user's file."""
+MAX_QUOTED_NAME_LENGTH = 60
+"""Maximum number of characters of a name that a message quotes."""
 
-def align_columns(rows: Sequence[Sequence[str]], left_columns: int) -> list[str]:
-    """Align a table of texts for a terminal.
-
-    Args:
-        rows: cells of the table.
-        left_columns: number of columns, from the first one, that are left-justified.
-
-    Returns:
-        One line per row.
-    """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if i < left_columns else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+SUPERSCRIPT_DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+"""Translation of digits and minus sign to superscripts."""
+_PLURAL_STEM = re.compile("(?<=[^aeiou])y$")
+_POWER_PATTERN = re.compile(r"(?:\^|\*\*)(-?\d+)")
 
 
 def join_first_names(names: Iterable[str], max_count: int = 4) -> str:
@@ -57,12 +50,6 @@ def format_run_names(names: Sequence[str], max_count: int) -> str:
     return f"run{'s' if len(names) > 1 else ''} {join_first_names(names, max_count)}"
 
 
-SUPERSCRIPT_DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-"""Translation of digits and minus sign to superscripts."""
-_PLURAL_STEM = re.compile("(?<=[^aeiou])y$")
-_POWER_PATTERN = re.compile(r"(?:\^|\*\*)(-?\d+)")
-
-
 def format_unit(unit: str) -> str:
     """Format a unit for print, such as ``kg·m²`` for ``kg*m^2``; empty for a pure number."""
     raised = _POWER_PATTERN.sub(lambda match: match[1].translate(SUPERSCRIPT_DIGITS), unit)
@@ -80,18 +67,6 @@ def append_unit(text: str, unit: str) -> str:
     return f"{text} {unit_text}" if unit_text else text
 
 
-MAX_NAME_LENGTH = 120
-"""Maximum number of characters of a name or label, which is used in file names."""
-MAX_TITLE_LENGTH = 300
-"""Maximum number of characters of a title."""
-MAX_DESCRIPTION_LENGTH = 5000
-"""Maximum number of characters of a description."""
-MAX_MESSAGE_LENGTH = 4000
-"""Maximum number of characters of a message, because it may quote a large part of a user's file."""
-MAX_QUOTED_NAME_LENGTH = 60
-"""Maximum number of characters of a name that a message quotes."""
-
-
 def truncate_text(text: str, max_length: int = MAX_QUOTED_NAME_LENGTH) -> str:
     """Truncate a text for a message.
 
@@ -100,3 +75,23 @@ def truncate_text(text: str, max_length: int = MAX_QUOTED_NAME_LENGTH) -> str:
         max_length: Maximum number of characters.
     """
     return text if len(text) <= max_length else f"{text[:max_length]}…"
+
+
+def align_columns(rows: Sequence[Sequence[str]], left_columns: int) -> list[str]:
+    """Align a table of texts for a terminal.
+
+    Args:
+        rows: cells of the table.
+        left_columns: number of columns, from the first one, that are left-justified.
+
+    Returns:
+        One line per row.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if i < left_columns else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]

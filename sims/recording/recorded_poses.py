@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from sims.core.angles_and_quaternions import compute_yaw_pitch_roll, unwrapped
+from sims.core.angles_and_quaternions import compute_yaw_pitch_roll, unwrap_angle
 from sims.core.simulator import Array, InputError
 
 POSITION_AXES = ("x", "y", "z")
@@ -103,5 +103,5 @@ def convert_quaternions(
     converted = {name: values for name, values in channels.items() if name not in names}
     for angle, values in zip(ANGLES, angles.T, strict=True):
         # NaN stays NaN, and whole turns are restored.
-        converted[f"q.{base}.{angle}"] = unwrapped(values)
+        converted[f"q.{base}.{angle}"] = unwrap_angle(values)
     return converted

@@ -5,7 +5,7 @@ input, in the units that the description states; an empty cell is a missing samp
 converted to SI units. Nothing is guessed, and the files are not changed. Every error is one line:
 file, row, column, what was expected, what was found.
 
-Division of a recording into runs for fitting and held-out runs or folds.
+The runs are divided into runs for fitting and held-out runs or cross-validation folds.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.core.angles_and_quaternions import unwrapped
+from sims.core.angles_and_quaternions import unwrap_angle
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.core.toml_validation import check_known_names
 from sims.recording.column_mapping import RecordingSources
@@ -36,10 +36,9 @@ from sims.recording.recording_description import (
     read_meta,
     read_system_name,
 )
-from sims.recording.unit_conversion import IDENTITY_SCALE, UnitScale
+from sims.recording.unit_conversion import convert_values
 
 __all__ = ["DeclaredSignals", "Recording", "Run", "read_recording", "read_system_name"]
-
 
 Mask = NDArray[np.bool_]
 Number = TypeVar("Number", bound=np.generic)
@@ -49,6 +48,15 @@ INPUT_HISTORY_SECONDS = 2.0
 
 Delays, rate limits and motion profiles do not depend on earlier inputs.
 """
+
+_UNMARKED = RunMetadata({}, {}, None)
+"""Metadata of a run that the description does not mention."""
+
+MAX_FOLDS = 3
+"""Maximum number of unmarked runs for cross-validation; of more, every third is held out."""
+
+_HELD_OUT_STRIDE = 3
+"""Every third run, or the last third of the samples of a single run, is held out."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -233,7 +241,7 @@ def read_recording(path: str | Path, declared: DeclaredSignals, whole: bool = Fa
     recording = assemble_recording(table, parts, description, description_path, model)
     if whole:
         return recording
-    return replace(recording, runs=split_runs(description_path, recording.runs, folds=False))
+    return replace(recording, runs=_split_runs(description_path, recording.runs, folds=False))
 
 
 def assemble_recording(
@@ -311,10 +319,6 @@ def _read_own_table(
     return renamed_runs
 
 
-_UNMARKED = RunMetadata({}, {}, None)
-"""Metadata of a run that the description does not mention."""
-
-
 def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> Run:
     """Make a run in SI units from its table and the metadata of the description.
 
@@ -328,19 +332,19 @@ def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> R
         description: units, scales and metadata from the TOML file.
     """
     metadata = description.runs.get(part.name, _UNMARKED)
+    subject = f"{table}: run {part.name!r}"
     channels = {
-        name: _convert_column(table, part, name, scale)
+        name: convert_values(part.columns[name], scale, f"{subject}, column {name}")
         for name, scale in description.channels.items()
     }
     inputs = {
-        name: _convert_column(table, part, name, scale)
+        name: convert_values(part.columns[name], scale, f"{subject}, column {name}")
         for name, scale in description.inputs.items()
     }
     for base, reference in description.orientations.items():
-        where = f"{table}: run {part.name!r}"
-        channels = convert_quaternions(channels, base, reference, where)
+        channels = convert_quaternions(channels, base, reference, subject)
     for name, command in description.wrapped.items():
-        channels[name] = make_read_only(unwrapped(channels[name], inputs.get(command)))
+        channels[name] = make_read_only(unwrap_angle(channels[name], inputs.get(command)))
     # Extra columns keep their unit, because no system reads them.
     extra = {name: part.columns[name] for name in description.extra if name in part.columns}
     initial_values = {
@@ -365,39 +369,6 @@ def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> R
     )
 
 
-def _convert_column(table: Path, part: CsvRun, name: str, scale: UnitScale) -> Array:
-    """Convert a column to SI units.
-
-    Args:
-        table: path of the table, for messages.
-        part: rows of one run.
-        name: name of the column.
-        scale: conversion from the unit of the column to SI units.
-
-    Raises:
-        InputError: A converted value is too large for a floating-point number.
-    """
-    values = part.columns[name]
-    if scale == IDENTITY_SCALE:
-        return values
-    # An overflow is reported below with the name of its column, which a warning would lack.
-    with np.errstate(over="ignore"):
-        result = values * scale.gain + scale.offset
-    if np.isinf(result).any():
-        raise InputError(
-            f"{table}: run {part.name!r}, column {name}: "
-            "a value is too large to convert to SI units"
-        )
-    return make_read_only(result)
-
-
-MAX_FOLDS = 3
-"""Maximum number of unmarked runs for cross-validation; of more, every third is held out."""
-
-_HELD_OUT_STRIDE = 3
-"""Every third run, or the last third of the samples of a single run, is held out."""
-
-
 def split_held_out(recording: Recording, folds: bool = False) -> Recording:
     """Divide the runs of a recording into runs for fitting and held-out runs.
 
@@ -413,10 +384,10 @@ def split_held_out(recording: Recording, folds: bool = False) -> Recording:
     """
     path = recording.path
     description = path.with_suffix(".toml") if path.suffix == ".csv" else path
-    return replace(recording, runs=split_runs(description, recording.runs, folds))
+    return replace(recording, runs=_split_runs(description, recording.runs, folds))
 
 
-def split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
+def _split_runs(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
     """Divide the runs into runs for fitting and held-out runs, on which predictions are tested.
 
     There are four cases:

@@ -1,4 +1,4 @@
-"""Read recordings from pandas data frames.
+"""Make recordings from pandas data frames, and state what their columns are.
 
 Columns of a ``DataFrame`` are checked by the same rules as those of `NAME.csv`.
 """
@@ -56,7 +56,73 @@ class Frame(Protocol):
         """Access to rows by number."""
 
 
-def move_index_to_columns(path: Path, frame: Frame) -> Any:
+@dataclass(frozen=True, kw_only=True)
+class FrameDescription:
+    """System of a recording, and the description of a data frame, which has no `NAME.toml` file.
+
+    Attributes:
+        system: Name of the system, instead of the one that the .toml file states.
+        model: Model file of a robot, MJCF or URDF, instead of what the .toml file states.
+        units: Units of a DataFrame's columns by name (default: those in ``df.attrs["units"]``).
+        constants: Known numbers of the system in SI units, with a DataFrame.
+        description: Any further entries about a DataFrame, with the keys of ``NAME.toml``.
+    """
+
+    system: Name | None = None
+    model: str | Path | None = None
+    units: Units | None = None
+    constants: Mapping[str, float] | None = None
+    description: Mapping[str, Any] | None = None
+
+    def refuse_for_files(self, recording: object) -> None:
+        """Reject a description of a data frame if the recording is a file, which has its own.
+
+        Args:
+            recording: path of the file, for the message.
+
+        Raises:
+            InputError: units, constants or a description are given.
+        """
+        for name in ("units", "constants", "description"):
+            if getattr(self, name):
+                raise InputError(
+                    f"{name}: expected only with a DataFrame; {recording} has a description "
+                    "that states them"
+                )
+
+
+def make_frame_recording(
+    frame: Frame,
+    declared: DeclaredSignals,
+    meta: Mapping[str, Any],
+    units: Mapping[str, str],
+    name: str = "DataFrame",
+) -> Recording:
+    """Make a recording from a data frame, checked as `read_recording` checks files.
+
+    Only the marked runs are held out.
+
+    Args:
+        frame: Data frame with columns ``run`` (for several runs), ``t`` and one for each channel
+            and input.
+        declared: System, or simulator of it.
+        meta: Description of the frame, with the keys of `NAME.toml`.
+        units: Units of columns by name; missing ones are taken from `meta` and
+            ``frame.attrs["units"]``.
+        name: Name of the frame in messages.
+
+    Raises:
+        InputError: The frame is malformed; the message is one line.
+    """
+    path = Path(name)
+    indexed_frame = _move_index_to_columns(path, frame)
+    document = _build_frame_description(path, indexed_frame, declared, meta, units)
+    description = check_description(path, document, declared)
+    parts = _read_frame(path, indexed_frame, description)
+    return assemble_recording(path, parts, description, path, get_model_reference(path, document))
+
+
+def _move_index_to_columns(path: Path, frame: Frame) -> Any:
     """Return the frame with ``run`` and ``t`` as columns if they are levels of its index.
 
     Args:
@@ -80,7 +146,7 @@ def move_index_to_columns(path: Path, frame: Frame) -> Any:
     return indexed_frame
 
 
-def build_frame_description(
+def _build_frame_description(
     path: Path,
     frame: Frame,
     declared: DeclaredSignals,
@@ -98,7 +164,7 @@ def build_frame_description(
 
     Args:
         path: Name of the frame, for messages.
-        frame: Data frame with columns as returned by `move_index_to_columns`.
+        frame: Data frame with columns as returned by `_move_index_to_columns`.
         declared: System, or simulator of it.
         meta: Statements of the user, with the keys of `NAME.toml`.
         units: Units of columns, by name.
@@ -217,12 +283,12 @@ def _make_unassigned_column_error(path: Path, name: str, declared: DeclaredSigna
     )
 
 
-def read_frame(path: Path, frame: Frame, description: RecordingDescription) -> list[CsvRun]:
+def _read_frame(path: Path, frame: Frame, description: RecordingDescription) -> list[CsvRun]:
     """Read the runs of a frame in order of appearance.
 
     Args:
         path: Name of the frame, for messages.
-        frame: Data frame with columns as returned by `move_index_to_columns`; it is one run if it
+        frame: Data frame with columns as returned by `_move_index_to_columns`; it is one run if it
             has no column ``run``.
         description: Checked description of the frame.
 
@@ -324,69 +390,3 @@ class _FrameTable(RecordingTable):
             found_text = "none" if missing[record] else f"{values[record]}"
             self.raise_error(record, column, f"expected a finite number, found {found_text}{note}")
         return values
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameDescription:
-    """System of a recording, and the description of a data frame, which has no `NAME.toml` file.
-
-    Attributes:
-        system: Name of the system, instead of the one that the .toml file states.
-        model: Model file of a robot, MJCF or URDF, instead of what the .toml file states.
-        units: Units of a DataFrame's columns by name (default: those in ``df.attrs["units"]``).
-        constants: Known numbers of the system in SI units, with a DataFrame.
-        description: Any further entries about a DataFrame, with the keys of ``NAME.toml``.
-    """
-
-    system: Name | None = None
-    model: str | Path | None = None
-    units: Units | None = None
-    constants: Mapping[str, float] | None = None
-    description: Mapping[str, Any] | None = None
-
-    def refuse_for_files(self, recording: object) -> None:
-        """Reject a description of a data frame if the recording is a file, which has its own.
-
-        Args:
-            recording: path of the file, for the message.
-
-        Raises:
-            InputError: units, constants or a description are given.
-        """
-        for name in ("units", "constants", "description"):
-            if getattr(self, name):
-                raise InputError(
-                    f"{name}: expected only with a DataFrame; {recording} has a description "
-                    "that states them"
-                )
-
-
-def make_frame_recording(
-    frame: Frame,
-    declared: DeclaredSignals,
-    meta: Mapping[str, Any],
-    units: Mapping[str, str],
-    name: str = "DataFrame",
-) -> Recording:
-    """Make a recording from a data frame, checked as `read_recording` checks files.
-
-    Only the marked runs are held out.
-
-    Args:
-        frame: Data frame with columns ``run`` (for several runs), ``t`` and one for each channel
-            and input.
-        declared: System, or simulator of it.
-        meta: Description of the frame, with the keys of `NAME.toml`.
-        units: Units of columns by name; missing ones are taken from `meta` and
-            ``frame.attrs["units"]``.
-        name: Name of the frame in messages.
-
-    Raises:
-        InputError: The frame is malformed; the message is one line.
-    """
-    path = Path(name)
-    indexed_frame = move_index_to_columns(path, frame)
-    document = build_frame_description(path, indexed_frame, declared, meta, units)
-    description = check_description(path, document, declared)
-    parts = read_frame(path, indexed_frame, description)
-    return assemble_recording(path, parts, description, path, get_model_reference(path, document))

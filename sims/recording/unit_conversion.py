@@ -1,4 +1,4 @@
-"""Convert units, and unwrap angles that are recorded within one turn.
+"""Convert values from the units of a file to SI units.
 
 Angles have their own dimension here: with the SI definition, hertz would be accepted as radians per
 second, and a plain number as an angle.
@@ -10,7 +10,9 @@ import re
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from sims.core.simulator import InputError
+import numpy as np
+
+from sims.core.simulator import Array, InputError, make_read_only
 
 _MAX_UNIT_LENGTH = 60
 """Maximum number of characters of a unit."""
@@ -85,6 +87,44 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
     )
 
 
+def convert_values(values: Array, scale: UnitScale, subject: str) -> Array:
+    """Convert values to another unit.
+
+    Args:
+        values: (T,) values, NaN where missing.
+        scale: Conversion of their unit.
+        subject: What the values are, such as file, run and column; error messages begin with it.
+
+    Returns:
+        (T,) converted values, read-only; `values` itself if nothing changes.
+
+    Raises:
+        InputError: A converted value is too large for a floating-point number.
+    """
+    if scale == IDENTITY_SCALE:
+        return values
+    # An overflow is reported below with the name of its column, which a warning would lack.
+    with np.errstate(over="ignore"):
+        result = values * scale.gain + scale.offset
+    if np.isinf(result).any():
+        raise InputError(f"{subject}: a value is too large to convert to SI units")
+    return make_read_only(result)
+
+
+def is_convertible(unit: str, target: str) -> bool:
+    """Return whether a unit converts to another one.
+
+    Args:
+        unit: Name of the unit; an empty one does not convert.
+        target: Name of the other unit.
+    """
+    try:
+        compute_unit_scale(unit, target)
+    except InputError:
+        return False
+    return bool(unit)
+
+
 def is_unit(unit: str) -> bool:
     """Return whether `unit` can be converted, which means that pint knows every name in it.
 
@@ -140,17 +180,3 @@ def _get_unit_registry() -> Any:
     # Clear the cache, in which an angle is still a plain number.
     registry._build_cache()
     return registry
-
-
-def is_convertible(unit: str, target: str) -> bool:
-    """Return whether a unit converts to another one.
-
-    Args:
-        unit: name of the unit; an empty one does not convert.
-        target: name of the other unit.
-    """
-    try:
-        compute_unit_scale(unit, target)
-    except InputError:
-        return False
-    return bool(unit)

@@ -1,4 +1,4 @@
-"""Pairs of geoms that touch, as elements `<pair>` of a robot's model.
+"""Pairs of geoms that touch: found in the poses of a motion, and as elements `<pair>` of a model.
 
 A contact has the parameters of both geoms in combination. An element `<pair>` replaces them for one
 pair, so that friction and softness of a pair can be changed without changing other contacts of its
@@ -19,6 +19,7 @@ import numpy as np
 from sims.core.simulator import Array, Simulator, make_unknown_name_error
 from sims.recording.recording import Recording
 from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.parsing.collision_filters import can_collide
 from sims.robot.robot_model import RobotModel, cache_per_robot
 
 PAIR_SEPARATOR = "/"
@@ -27,13 +28,10 @@ UNNAMED_PREFIX = "simgap."
 """Prefix of the names that are given to unnamed geoms, such as ``simgap.geom3``."""
 MIN_MIX = 1e-15
 """Weight `solmix` below which a geom has no weight (MuJoCo's mjMINVAL)."""
-
 CHECKED_INSTANTS = 100
 """Maximum number of times of a run at which forces or contacts are evaluated."""
-
 MAX_CONTACTS = 12
 """Maximum number of contacts at which effects are candidates."""
-
 _STATIC_TREE = -1
 """Index by which MuJoCo marks bodies that do not move."""
 
@@ -243,7 +241,7 @@ def find_contacts(
     At most `CHECKED_INSTANTS` poses of the motion are evaluated.
 
     Args:
-        kind: Simulator class of the robot.
+        kind: simulator class of the robot.
         positions: (N,) position of each joint at N times, rad or m, by channel; other joints keep
             their initial position.
 
@@ -264,14 +262,12 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
     Held-out runs are not used.
 
     Args:
-        recording: Recording of the robot.
-        kind: Simulator class of the robot.
+        recording: recording of the robot.
+        kind: simulator class of the robot.
 
     Returns:
         Names of at most `MAX_CONTACTS` pairs, the most frequent ones, in alphabetical order.
     """
-    # This import is needed for robots only.
-
     model = kind.robot.compiled  # type: ignore[attr-defined]
     if not can_touch(model):
         return ()
@@ -303,10 +299,7 @@ def can_touch(model: Any) -> bool:
     Args:
         model: compiled model (mujoco.MjModel).
     """
-    # These imports are needed for robots only.
     import mujoco
-
-    from sims.robot.parsing.collision_filters import can_collide
 
     is_disabled = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     return not is_disabled and can_collide(model)
@@ -322,9 +315,9 @@ def _select_acting_pairs(
     trees are added until none is reached by a contact any more.
 
     Args:
-        model: Compiled model (mujoco.MjModel).
-        pairs: Pairs of geoms that touch.
-        recorded_trees: Kinematic trees (`MjModel.body_treeid`) with recorded joints.
+        model: compiled model (mujoco.MjModel).
+        pairs: pairs of geoms that touch.
+        recorded_trees: kinematic trees (`MjModel.body_treeid`) with recorded joints.
 
     Returns:
         The pairs in their order.

@@ -1,4 +1,4 @@
-"""Fitted causes, with effect families resolved to single places."""
+"""Fitted causes of a robot: collect them from a fit, and resolve effect families to places."""
 
 from __future__ import annotations
 
@@ -23,16 +23,63 @@ _COEFFICIENT_NAMES: Mapping[str, tuple[str, ...]] = {
     "gravity.tilt": ("x", "y"),
 }
 """Names of the coefficients of effects with several coefficients, in their order."""
-
-
 MAX_COMPENSATED_GRAVITY_SHARE = 0.02
 """Largest remaining share of gravity at which a robot counts as gravity-compensated."""
-
 GRAVITY_COMPENSATED = "gravity is compensated: the real robot or its controller carries its weight"
 """Text for a gravity correction that removes gravity completely."""
-
 CauseCoefficients = Mapping[str, Mapping[str, FittedValue]]
 """Coefficients by ``effect@place``, ``effect@*`` or ``effect``."""
+
+
+def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, FittedValue]]:
+    """Collect the fitted changes of a robot as coefficients by effect.
+
+    They are numbers of its model file that the user freed for the fit, diagnosed effects, and the
+    time step and other options of the integrator if they differ from those of the file.
+
+    Args:
+        extended: extended simulator of a robot, with the fitted values.
+    """
+    kind: Any = extended.kind
+    causes: dict[str, Mapping[str, FittedValue]] = {}
+    for effect in kind.system.freed_effects:
+        names = [coefficient.name for coefficient in effect.coefficients]
+        # A freed number is a parameter with the name of its effect, and of its coefficient if there
+        # are several.
+        parameters = (
+            [effect.name] if len(names) == 1 else [f"{effect.name}.{name}" for name in names]
+        )
+        causes[effect.name] = {
+            name: extended.parameters[parameter]
+            for name, parameter in zip(names, parameters, strict=True)
+        }
+    return {**causes, **extended.effects, **_list_numerics_causes(kind)}
+
+
+def _list_numerics_causes(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
+    """Return the options of the model as causes, if they differ from those of the model file.
+
+    The step is in seconds; an option that is a word in the file has its MuJoCo number. They have no
+    intervals because they are chosen, not fitted.
+    """
+    from sims.robot.integrator_settings import list_changed_options
+
+    return {
+        effect: {effect.removeprefix("numerics."): make_option_value(effect, *numbers)}
+        for effect, numbers in list_changed_options(kind.robot, kind.numerics).items()
+    }
+
+
+def make_option_value(effect: str, stated: float, number: float) -> FittedValue:
+    """Return the value of a changed option of the model file, which is chosen and has no interval.
+
+    Args:
+        effect: effect that names the option, such as ``numerics.impratio``.
+        stated: number in the model file.
+        number: number that replaces it.
+    """
+    unit = "s" if effect == "numerics.step" else "1"
+    return FittedValue(float(number), unit, None, None, stated=float(stated), total=float(number))
 
 
 def is_gravity_compensated(effect: str, numbers: Mapping[str, FittedValue]) -> bool:
@@ -87,9 +134,9 @@ class FittedCause:
         ``numerics.integrator: from Euler to RK4``.
 
         Args:
-            recording: Name of the recording for the text; empty to leave it out.
+            recording: name of the recording for the text; empty to leave it out.
         """
-        # This import is needed for robots only.
+        # Every explanation imports this module, but only one of a robot needs the other.
         from sims.robot.integrator_settings import OPTION_EFFECTS, format_option
 
         has_several = len(self.numbers) > 1
@@ -189,54 +236,3 @@ def _list_places(robot: RobotModel, effect: str) -> list[str]:
     if effect.startswith("sensor."):
         return [ALL_PLACES]
     return [joint.name for joint in robot.joints]
-
-
-def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, FittedValue]]:
-    """Collect the fitted changes of a robot as coefficients by effect.
-
-    They are numbers of its model file that the user freed for the fit, diagnosed effects, and the
-    time step and other options of the integrator if they differ from those of the file.
-
-    Args:
-        extended: extended simulator of a robot, with the fitted values.
-    """
-    kind: Any = extended.kind
-    causes: dict[str, Mapping[str, FittedValue]] = {}
-    for effect in kind.system.freed_effects:
-        names = [coefficient.name for coefficient in effect.coefficients]
-        # A freed number is a parameter with the name of its effect, and of its coefficient if there
-        # are several.
-        parameters = (
-            [effect.name] if len(names) == 1 else [f"{effect.name}.{name}" for name in names]
-        )
-        causes[effect.name] = {
-            name: extended.parameters[parameter]
-            for name, parameter in zip(names, parameters, strict=True)
-        }
-    return {**causes, **extended.effects, **_list_numerics_causes(kind)}
-
-
-def _list_numerics_causes(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
-    """Return the options of the model as causes, if they differ from those of the model file.
-
-    The step is in seconds; an option that is a word in the file has its MuJoCo number. They have no
-    intervals because they are chosen, not fitted.
-    """
-    from sims.robot.integrator_settings import list_changed_options
-
-    return {
-        effect: {effect.removeprefix("numerics."): make_option_value(effect, *numbers)}
-        for effect, numbers in list_changed_options(kind.robot, kind.numerics).items()
-    }
-
-
-def make_option_value(effect: str, stated: float, number: float) -> FittedValue:
-    """Return the value of a changed option of the model file, which is chosen and has no interval.
-
-    Args:
-        effect: Effect that names the option, such as ``numerics.impratio``.
-        stated: Number in the model file.
-        number: Number that replaces it.
-    """
-    unit = "s" if effect == "numerics.step" else "1"
-    return FittedValue(float(number), unit, None, None, stated=float(stated), total=float(number))

@@ -10,7 +10,6 @@ from sims.core import toml_validation
 from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.robot.parsing.floating_bases import fix_bases
-from sims.robot.robot_model import RobotModel
 
 if TYPE_CHECKING:
     from sims.robot.robot_model import RobotModel

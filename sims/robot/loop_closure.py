@@ -226,6 +226,51 @@ class _LoopModel:
         return dict(zip(self._names, states, strict=True))
 
 
+def list_following_joints(
+    robot: RobotModel, loops: Sequence[Collection[str]], measured: Collection[str]
+) -> list[str]:
+    """Return the names of unmeasured joints that the measured ones of their closed loop move.
+
+    The result has no joints of a loop without a measured joint, since its drives move it; and
+    none of a loop with a drive at an unmeasured joint, since this drive moves it, too.
+
+    Args:
+        robot: model of the robot with its joints and actuators.
+        loops: names of the joints of each closed loop.
+        measured: names of the measured states, such as ``q.crank`` and ``q.rod.qw``.
+    """
+    # An actuator drives one joint, or those of its tendon.
+    driven = {joint for a in robot.actuators for joint in (a.joint, *a.moves)}
+    following = list[str]()
+    for loop in loops:
+        unmeasured = list_unmeasured_joints(robot, loop, measured)
+        has_measured_joint = len(unmeasured) < len(loop)
+        if has_measured_joint and driven.isdisjoint(unmeasured):
+            following += unmeasured
+    return following
+
+
+def list_unmeasured_joints(
+    robot: RobotModel, joints: Collection[str], measured: Collection[str]
+) -> list[str]:
+    """Return the names of those joints of a loop that are not measured, sorted.
+
+    A joint counts as measured if any of its positions or velocities is.
+
+    Args:
+        robot: model of the robot with its joints.
+        joints: names of the joints, of any kind.
+        measured: names of the measured states, such as ``q.crank``.
+    """
+    unmeasured = []
+    for name in sorted(joints):
+        position_units, velocity_units = list_state_units(robot.joint(name))
+        states = {*position_units, *velocity_units}  # their names
+        if states.isdisjoint(measured):
+            unmeasured.append(name)
+    return unmeasured
+
+
 def list_joints_placed_by_loops(robot: RobotModel) -> list[Joint]:
     """Return the floating joints whose pose follows from those of the joints with one coordinate.
 

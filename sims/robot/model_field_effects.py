@@ -19,8 +19,7 @@ body:
 * (9) Softened: `solref` (t, z) of a contact becomes (t (1 + c), z), or (t, z (1 + c)) for its
   damping. In the direct form (-k, -b), k is proportional to 1 / (t z)^2 and b to 1 / t.
 
-`robot.model_field_effects` writes these fields, `export.model_file_totals` reads the numbers in
-them.
+`dynamics.mujoco_batch` writes these fields, `export.model_file_totals` reads the numbers in them.
 """
 
 from __future__ import annotations

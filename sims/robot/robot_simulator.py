@@ -23,9 +23,8 @@ from sims.core.simulator import Array, InputError, Scenario, make_unknown_name_e
 from sims.core.toml_validation import format_value
 from sims.engines.scenario_groups import ScenarioGroups, group_scenarios
 from sims.robot.dynamics.activation_filters import (
-    ActivationFilter,
     activation_filters,
-    extend_into_past,
+    compute_initial_activation,
     select_initial_activations,
 )
 from sims.robot.dynamics.active_effects import (
@@ -439,14 +438,32 @@ class RobotSimulator(SystemSimulator):
         forces[:, :, dofs] += compute_time_dependent_forces(
             self.robotic, batch.acting, step_starts, len(dofs), batch_size
         )
-        # 4. Activations.
+        # 4. Activations. A filter's state at the start may follow from commands before the run.
+        is_rk4 = self._model_options["integrator"] == RK4_INTEGRATOR_ID
+
+        def compute_past_inputs(scenario: Scenario, steps: int) -> Mapping[str, Array]:
+            """Compute the applied inputs (n, S) of a scenario that begins before the run."""
+            commands = self.run_inputs(scenario)
+            return compute_inputs_over_steps(
+                self.time_step, scenario, commands, batch.acting, batch_size, steps
+            )
+
         initial_activations = np.zeros((batch_size, model.na))
         for activation_filter in activation_filters(self.robot):
             filter_controls = controls[:, :, activation_filter.actuator.control]
-            initial = self._compute_initial_activation(activation_filter, batch, filter_controls)
+            initial = compute_initial_activation(
+                activation_filter,
+                batch.scenario,
+                filter_controls,
+                self.time_step,
+                is_rk4,
+                compute_past_inputs,
+            )
             initial_activations[:, activation_filter.address] = initial
             # The servo's effective set point is the activation instead of the command.
-            activations = self._integrate_activations(activation_filter, filter_controls, initial)
+            activations = activation_filter.compute_activations(
+                filter_controls, initial, self.time_step, is_rk4
+            )
             applied_inputs[f"u.{activation_filter.actuator.name}"] = activations[:, :-1]
         # 5. Switched actuators.
         off_mask = compute_off_steps(self.robot, batch.scenario, self.time_step, steps)
@@ -457,65 +474,6 @@ class RobotSimulator(SystemSimulator):
             instant_controls,
             initial_activations,
             np.broadcast_to(off_mask, (batch_size, *off_mask.shape)),
-        )
-
-    def _compute_initial_activation(
-        self, activation_filter: ActivationFilter, batch: RobotRunBatch, controls: Array
-    ) -> Array:
-        """Return the activation (n,) of a filter at the start of a run, for n batch elements.
-
-        It is the first of these that is known:
-
-        1. the value that the recording states,
-        2. the result of the filter for the commands before the run,
-        3. the output of a filter that has settled at the first command.
-
-        Args:
-            activation_filter: filter: its actuator, time constant and kind.
-            batch: batch elements of the run.
-            controls: (n, S) controls of the filter in the S steps of the run.
-        """
-        # 1. Stated value, by the filter's name among the initial states.
-        stated_activations = select_initial_activations(self.robot, batch.scenario.initial)
-        if activation_filter.state in stated_activations:
-            return np.full(len(batch.x), stated_activations[activation_filter.state])
-        # 3. Without known commands before the run, the filter has settled.
-        history = extend_into_past(batch.scenario, self.time_step)
-        if history is None:
-            settled_activation: Array = np.clip(
-                activation_filter.clip_controls(controls[:, 0]), *activation_filter.limits
-            )
-            return settled_activation
-        # 2. The filter has settled at the first of the commands before the run.
-        scenario, steps_before_run = history
-        commands = self.run_inputs(scenario)
-        applied_inputs = compute_inputs_over_steps(
-            self.time_step, scenario, commands, batch.acting, len(batch.x), steps_before_run
-        )
-        earlier_controls = applied_inputs[f"u.{activation_filter.actuator.name}"]
-        first_activation = activation_filter.clip_controls(earlier_controls[:, 0])
-        activations = self._integrate_activations(
-            activation_filter, earlier_controls, first_activation
-        )
-        last_activation: Array = activations[:, -1]
-        return last_activation
-
-    def _integrate_activations(
-        self, activation_filter: ActivationFilter, controls: Array, initial_activations: Array
-    ) -> Array:
-        """Integrate an activation filter over S steps, as MuJoCo's integrator does.
-
-        Args:
-            activation_filter: filter: its actuator, time constant and kind.
-            controls: (n, S) controls of n batch elements over the steps.
-            initial_activations: (n,) activations at the beginning.
-
-        Returns:
-            (n, S + 1) activations at the beginnings of steps, and at the end.
-        """
-        is_rk4 = self._model_options["integrator"] == RK4_INTEGRATOR_ID
-        return activation_filter.compute_activations(
-            controls, initial_activations, self.time_step, is_rk4
         )
 
     def run_initial(self, scenario: Scenario) -> dict[str, float]:

@@ -20,7 +20,9 @@ from sims.robot.floating_joints import FloatingJoints, list_state_units
 from sims.robot.loop_closure import (
     close_loops,
     coupled_joints,
+    list_following_joints,
     list_joints_placed_by_loops,
+    list_unmeasured_joints,
     settle_loops,
 )
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
@@ -110,48 +112,13 @@ class RobotSystem(System):
             All given states, changed where joints are placed.
         """
         unmeasured = [
-            name for loop in cls.joint_loops for name in cls._list_unmeasured(loop, measured)
+            name
+            for loop in cls.joint_loops
+            for name in list_unmeasured_joints(cls.robot, loop, measured)
         ]
         closed = close_loops(cls.robot, states, unmeasured)
-        return settle_loops(cls.robot, closed, cls.list_following_joints(measured))
-
-    @classmethod
-    def list_following_joints(cls, measured: Collection[str]) -> list[str]:
-        """Return the names of unmeasured joints that the measured ones of their closed loop move.
-
-        The result has no joints of a loop without a measured joint, since its drives move it; and
-        none of a loop with a drive at an unmeasured joint, since this drive moves it, too.
-
-        Args:
-            measured: names of the measured states, such as ``q.crank`` and ``q.rod.qw``.
-        """
-        # An actuator drives one joint, or those of its tendon.
-        driven = {joint for a in cls.robot.actuators for joint in (a.joint, *a.moves)}
-        following = list[str]()
-        for loop in cls.joint_loops:
-            unmeasured = cls._list_unmeasured(loop, measured)
-            has_measured_joint = len(unmeasured) < len(loop)
-            if has_measured_joint and driven.isdisjoint(unmeasured):
-                following += unmeasured
-        return following
-
-    @classmethod
-    def _list_unmeasured(cls, joints: Collection[str], measured: Collection[str]) -> list[str]:
-        """Return the names of those joints of a loop that are not measured, sorted.
-
-        A joint counts as measured if any of its positions or velocities is.
-
-        Args:
-            joints: names of the joints, of any kind.
-            measured: names of the measured states, such as ``q.crank``.
-        """
-        unmeasured = []
-        for name in sorted(joints):
-            position_units, velocity_units = list_state_units(cls.robot.joint(name))
-            states = {*position_units, *velocity_units}  # their names
-            if states.isdisjoint(measured):
-                unmeasured.append(name)
-        return unmeasured
+        following = list_following_joints(cls.robot, cls.joint_loops, measured)
+        return settle_loops(cls.robot, closed, following)
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.medians import compute_nan_median
+from sims.core.noise_estimation import SIGMA_PER_MEDIAN
 from sims.core.simulator import Array
 from sims.vision.ball_renderer import RgbImage
 
@@ -15,14 +16,8 @@ _HIDDEN_RADII = 1.3
 """Distance around a ball's centre at which it hides the background with its soft edge, in radii."""
 _HIDDEN_MARGIN_PIXELS = 3
 """Additional margin around a ball that compression affects, pixels."""
-_SIGMA_PER_MEDIAN = 1.4826
-"""Standard deviation of normal noise divided by its median magnitude."""
 _LARGEST_OF_THREE_RATIO = 1.5
 """Assumed ratio of the largest of three noise magnitudes to a single one."""
-
-
-MIN_EMPTY_FRAMES = 3
-"""Minimum number of frames without an object that prove that it is in the background estimate."""
 
 
 def select_frames(moved: Array) -> list[int]:
@@ -111,7 +106,7 @@ def estimate_camera_noise(pictures: list[RgbImage], background: RgbImage) -> flo
     ]
     median = np.median(np.stack(largest_differences))
     # The largest of three colours differs more than a single one.
-    return float(_SIGMA_PER_MEDIAN * median / _LARGEST_OF_THREE_RATIO)
+    return float(SIGMA_PER_MEDIAN * median / _LARGEST_OF_THREE_RATIO)
 
 
 def _compute_largest_difference(picture: RgbImage, background: RgbImage) -> NDArray[np.int16]:

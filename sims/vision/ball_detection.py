@@ -5,6 +5,8 @@ The edge is located along rays from the centre where the difference has fallen t
 inside: there the ball covers half of a pixel, whatever its colour. Rays that meet other things (a
 shadow, the picture's edge, a patch of similar colour) are outliers of the circle and are ignored; a
 region in which too few rays agree is not a ball.
+
+`make_detector` estimates the background of a film and makes its detector.
 """
 
 from __future__ import annotations
@@ -17,7 +19,6 @@ from numpy.typing import NDArray
 
 from sims.core.simulator import Array
 from sims.vision import background_model, circle_fit
-from sims.vision.background_model import MIN_EMPTY_FRAMES
 from sims.vision.ball_renderer import RgbImage
 from sims.vision.circle_fit import Circle
 from sims.vision.video_files import import_package
@@ -42,8 +43,6 @@ _CONVERGED_PIXELS = 0.02
 """Change of a circle in pixels below which the iteration ends."""
 _RAY_SAMPLE_SPACING = 0.25
 """Spacing of samples along a ray, pixels."""
-_TUKEY_WIDTH_KNOWN_RADIUS = 0.5
-"""Width of the robust weights in pixels when the radius is known."""
 _UNSHADED_RIM_PIXELS = 5
 """Width in pixels of the line around a region in which nothing is treated as shadow."""
 _SURROUNDINGS_RADII = 1.6
@@ -54,18 +53,8 @@ _MAX_SHADOW_DEVIATION = 6.0
 """Maximum deviation of the colours from a common factor for shadow, grey levels."""
 _PADDING_VALUE = -1000.0
 """Value for pixels outside the picture, far below every difference."""
-_MIN_DETERMINANT = 1e-6
-"""Determinant below which an edge does not determine a centre."""
-_MAX_GAUSS_NEWTON_STEPS = 12
-"""Maximum number of Gauss-Newton steps."""
-
-GreyLevels: TypeAlias = NDArray[np.float32]
-"""Grey levels, or positions in pixels."""
-Mask: TypeAlias = NDArray[np.bool_]
 _MIN_REFIT_RAY_SHARE = 0.4
 """Smallest share of rays with an edge point from which a centre is refitted."""
-_CENTRE_TOLERANCE = 1e-3
-"""Change of a fitted centre, in pixels, below which its fit has converged."""
 _RAY_SHARES = (0.7, 1.5)
 """Beginning and end of the rays, as shares of the approximate radius."""
 _RAY_MARGIN = 2
@@ -94,11 +83,18 @@ _COMPARED_FRAMES = 8
 _MIN_SHADOW_REMOVAL_RATIO = 0.8
 """Minimum ratio of the ray agreement with and without shadow removal at which it is used."""
 
+_MIN_EMPTY_FRAMES = 3
+"""Minimum number of frames without an object that prove that it is in the background estimate."""
+
 _SAME_CENTRE_SHARE = 0.3
 """Distance of the centres of two circles at rest that are one object, as a share of the radius."""
 
 _SAME_RADIUS_RATIOS = (0.7, 1.4)
 """Ratios of the radii of two circles between which they may be one object."""
+
+GreyLevels: TypeAlias = NDArray[np.float32]
+"""Grey levels, or positions in pixels."""
+Mask: TypeAlias = NDArray[np.bool_]
 
 
 class BallDetection(NamedTuple):
@@ -129,11 +125,9 @@ class BallDetection(NamedTuple):
     def refit_with_radius(self, radius: float) -> BallDetection:
         """Return the detection with its centre refitted for a radius known from other pictures.
 
-        If shade hides a part of the edge, a fit with free radius shifts both centre and radius.
-        Here only the centre (u, v) is fitted to the edge points: with their distance d from the
-        centre and the unit vector n towards them, Gauss-Newton steps solve
-        d - radius = n . (du, dv) by weighted least squares. The detection is returned unchanged if
-        there are too few edge points, or the fit moves to the edge of another object.
+        If shade hides a part of the edge, a fit with free radius shifts both centre and radius;
+        here only the centre is fitted. The detection is returned unchanged if the edge points are
+        too few or do not determine a centre, or the fit moves to the edge of another object.
 
         Args:
             radius: Known radius, pixels.
@@ -141,31 +135,122 @@ class BallDetection(NamedTuple):
         # Too few edge points, such as none of a ball of a few pixels.
         if len(self.edges) < _MIN_REFIT_RAY_SHARE * _RAY_COUNT:
             return self
-        u, v = self.u, self.v
-        for _ in range(_MAX_GAUSS_NEWTON_STEPS):
-            away_u = self.edges[:, 0] - u
-            away_v = self.edges[:, 1] - v
-            distances = np.maximum(np.hypot(away_u, away_v), 1e-9)
-            residual = distances - radius
-            # Geman-McClure weights: points off the circle hardly count.
-            weights = 1 / (1 + (residual / _TUKEY_WIDTH_KNOWN_RADIUS) ** 2) ** 2
-            rows = np.stack([away_u / distances, away_v / distances, residual])
-            normal = (rows * weights) @ rows.T
-            # Normal equations (a b; b c) (du, dv) = (p, q), solved by Cramer's rule.
-            (a, b, p), (_, c, q), _ = normal.tolist()
-            determinant = a * c - b * b
-            if determinant < _MIN_DETERMINANT:
-                return self
-            du = (c * p - b * q) / determinant
-            dv = (a * q - b * p) / determinant
-            u += du
-            v += dv
-            if abs(du) + abs(dv) < _CENTRE_TOLERANCE:
-                break
+        centre = circle_fit.fit_centre(self.edges, (self.u, self.v), radius)
         # So far away, the circle follows the edge of another object.
-        if np.hypot(u - self.u, v - self.v) > 0.5 * radius:
+        if centre is None or np.hypot(centre[0] - self.u, centre[1] - self.v) > 0.5 * radius:
             return self
-        return self._replace(u=u, v=v)
+        return self._replace(u=centre[0], v=centre[1])
+
+
+def make_detector(pictures: list[RgbImage]) -> BallDetector:
+    """Make a detector of balls, with a background estimated from some pictures.
+
+    The background is first the median of the pictures. Twice, the objects are detected with it, and
+    it is estimated again without the pixels that they hide. The detector removes shadows if about
+    as many round objects are found with that as without.
+
+    Args:
+        pictures: Some pictures (height, width, 3) of the film.
+    """
+    background = background_model.compute_median_background(pictures)
+    # Both treatments of shadows are compared on some of the pictures.
+    stride = max(1, len(pictures) // _COMPARED_FRAMES)
+    # Two passes: objects hidden by the first background are detected with the second.
+    for _ in range(2):
+        sigma = background_model.estimate_camera_noise(pictures, background)
+        shadow_detector = BallDetector(background, sigma, shadows=True)
+        plain_detector = BallDetector(background, sigma, shadows=False)
+        shadow_detections = [shadow_detector.detect(p, ghosts=True) for p in pictures[::stride]]
+        plain_detections = [plain_detector.detect(p, ghosts=True) for p in pictures[::stride]]
+        # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
+        min_roundness = _MIN_SHADOW_REMOVAL_RATIO * _compute_roundness(plain_detections)
+        if _compute_roundness(shadow_detections) >= min_roundness:
+            detector, known_detections = shadow_detector, shadow_detections
+        else:
+            detector, known_detections = plain_detector, plain_detections
+        detections = []
+        for i, picture in enumerate(pictures):
+            if i % stride == 0:
+                detections.append(known_detections[i // stride])
+            else:
+                detections.append(detector.detect(picture, ghosts=True))
+        hiding_circles = _list_hiding_circles(detections)
+        shadow_masks = None
+        if detector.shadows:
+            # If a shadow of the background is missing in some pictures, these show the true
+            # background; the shadow hides it in the others.
+            is_lit = np.stack([detector.find_missing_shadow(picture) for picture in pictures])
+            shadow_masks = ~is_lit & (is_lit.sum(axis=0) >= _MIN_EMPTY_FRAMES)
+        background = background_model.compute_masked_background(
+            pictures, hiding_circles, background, shadow_masks
+        )
+    return BallDetector(background, sigma, detector.shadows)
+
+
+def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
+    """Return how round the detected objects are: the sum over pictures of the best ray agreement.
+
+    The ray agreement of a detection is the fraction of rays from its centre that meet the edge on
+    a circle.
+
+    Args:
+        pictures: Detections in each picture; ghosts (objects in the background image that the
+            picture lacks) do not count.
+    """
+    return sum(
+        max(
+            (detection.ray_agreement for detection in detections if not detection.is_ghost),
+            default=0.0,
+        )
+        for detections in pictures
+    )
+
+
+def _list_hiding_circles(detections: list[list[BallDetection]]) -> list[list[Circle]]:
+    """Return the circles that hide the true background in each picture.
+
+    They are the detected objects, and objects in the present estimate of the background: a ball
+    that rests for most of the film, or its shadow, is part of the median. In pictures without it,
+    it is detected as a ghost; these show the true background, and all others are hidden there.
+
+    Args:
+        detections: detections in each picture, including ghosts.
+    """
+    hiding_circles: list[list[Circle]] = []
+    ghosts: list[list[Circle]] = []
+    for picture_detections in detections:
+        hiding_circles.append([(d.u, d.v, d.radius) for d in picture_detections if not d.is_ghost])
+        ghosts.append([(d.u, d.v, d.radius) for d in picture_detections if d.is_ghost])
+    for ghost in [circle for circles in ghosts for circle in circles]:
+        # Whether the object is missing in each picture.
+        are_without_object = [
+            any(_is_same_object(ghost, circle) for circle in circles) for circles in ghosts
+        ]
+        # In one or two pictures it may be missed by mistake.
+        if sum(are_without_object) < _MIN_EMPTY_FRAMES:
+            continue
+        for circles, is_without_object in zip(hiding_circles, are_without_object, strict=True):
+            if not is_without_object:
+                circles.append(ghost)
+    return hiding_circles
+
+
+def _is_same_object(a: Circle, b: Circle) -> bool:
+    """Return whether two circles are the same object at rest.
+
+    The distance of their centres (sum of both coordinates) may be `_SAME_CENTRE_SHARE` of the
+    radius and half a pixel, and their radii may differ by `_SAME_RADIUS_RATIOS`.
+
+    Args:
+        a: centre and radius of one circle, pixels.
+        b: centre and radius of the other one.
+    """
+    u, v, radius = a
+    other_u, other_v, other_radius = b
+    distance = abs(u - other_u) + abs(v - other_v)
+    min_ratio, max_ratio = _SAME_RADIUS_RATIOS
+    is_near = distance < _SAME_CENTRE_SHARE * other_radius + 0.5
+    return is_near and min_ratio < radius / other_radius < max_ratio
 
 
 class BallDetector:
@@ -637,114 +722,3 @@ def _compute_ray_directions() -> tuple[Array, Array]:
     """Return the cosines and sines (rays, 1) of the ray directions."""
     angles = np.linspace(0, 2 * np.pi, _RAY_COUNT, endpoint=False)[:, None]
     return np.cos(angles), np.sin(angles)
-
-
-def make_detector(pictures: list[RgbImage]) -> BallDetector:
-    """Make a detector of balls, with a background estimated from some pictures.
-
-    The background is first the median of the pictures. Twice, the objects are detected with it, and
-    it is estimated again without the pixels that they hide. The detector removes shadows if about
-    as many round objects are found with that as without.
-
-    Args:
-        pictures: Some pictures (height, width, 3) of the film.
-    """
-    background = background_model.compute_median_background(pictures)
-    # Both treatments of shadows are compared on some of the pictures.
-    stride = max(1, len(pictures) // _COMPARED_FRAMES)
-    # Two passes: objects hidden by the first background are detected with the second.
-    for _ in range(2):
-        sigma = background_model.estimate_camera_noise(pictures, background)
-        shadow_detector = BallDetector(background, sigma, shadows=True)
-        plain_detector = BallDetector(background, sigma, shadows=False)
-        shadow_detections = [shadow_detector.detect(p, ghosts=True) for p in pictures[::stride]]
-        plain_detections = [plain_detector.detect(p, ghosts=True) for p in pictures[::stride]]
-        # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
-        min_roundness = _MIN_SHADOW_REMOVAL_RATIO * _compute_roundness(plain_detections)
-        if _compute_roundness(shadow_detections) >= min_roundness:
-            detector, known_detections = shadow_detector, shadow_detections
-        else:
-            detector, known_detections = plain_detector, plain_detections
-        detections = []
-        for i, picture in enumerate(pictures):
-            if i % stride == 0:
-                detections.append(known_detections[i // stride])
-            else:
-                detections.append(detector.detect(picture, ghosts=True))
-        hiding_circles = list_hiding_circles(detections)
-        shadow_masks = None
-        if detector.shadows:
-            # If a shadow of the background is missing in some pictures, these show the true
-            # background; the shadow hides it in the others.
-            is_lit = np.stack([detector.find_missing_shadow(picture) for picture in pictures])
-            shadow_masks = ~is_lit & (is_lit.sum(axis=0) >= MIN_EMPTY_FRAMES)
-        background = background_model.compute_masked_background(
-            pictures, hiding_circles, background, shadow_masks
-        )
-    return BallDetector(background, sigma, detector.shadows)
-
-
-def _compute_roundness(pictures: list[list[BallDetection]]) -> float:
-    """Return how round the detected objects are: the sum over pictures of the best ray agreement.
-
-    The ray agreement of a detection is the fraction of rays from its centre that meet the edge on
-    a circle.
-
-    Args:
-        pictures: Detections in each picture; ghosts (objects in the background image that the
-            picture lacks) do not count.
-    """
-    return sum(
-        max(
-            (detection.ray_agreement for detection in detections if not detection.is_ghost),
-            default=0.0,
-        )
-        for detections in pictures
-    )
-
-
-def list_hiding_circles(detections: list[list[BallDetection]]) -> list[list[Circle]]:
-    """Return the circles that hide the true background in each picture.
-
-    They are the detected objects, and objects in the present estimate of the background: a ball
-    that rests for most of the film, or its shadow, is part of the median. In pictures without it,
-    it is detected as a ghost; these show the true background, and all others are hidden there.
-
-    Args:
-        detections: Detections in each picture, including ghosts.
-    """
-    hiding_circles: list[list[Circle]] = []
-    ghosts: list[list[Circle]] = []
-    for picture_detections in detections:
-        hiding_circles.append([(d.u, d.v, d.radius) for d in picture_detections if not d.is_ghost])
-        ghosts.append([(d.u, d.v, d.radius) for d in picture_detections if d.is_ghost])
-    for ghost in [circle for circles in ghosts for circle in circles]:
-        # Whether the object is missing in each picture.
-        are_without_object = [
-            any(_is_same_object(ghost, circle) for circle in circles) for circles in ghosts
-        ]
-        # In one or two pictures it may be missed by mistake.
-        if sum(are_without_object) < MIN_EMPTY_FRAMES:
-            continue
-        for circles, is_without_object in zip(hiding_circles, are_without_object, strict=True):
-            if not is_without_object:
-                circles.append(ghost)
-    return hiding_circles
-
-
-def _is_same_object(a: Circle, b: Circle) -> bool:
-    """Return whether two circles are the same object at rest.
-
-    The distance of their centres (sum of both coordinates) may be `_SAME_CENTRE_SHARE` of the
-    radius and half a pixel, and their radii may differ by `_SAME_RADIUS_RATIOS`.
-
-    Args:
-        a: centre and radius of one circle, pixels.
-        b: centre and radius of the other one.
-    """
-    u, v, radius = a
-    other_u, other_v, other_radius = b
-    distance = abs(u - other_u) + abs(v - other_v)
-    min_ratio, max_ratio = _SAME_RADIUS_RATIOS
-    is_near = distance < _SAME_CENTRE_SHARE * other_radius + 0.5
-    return is_near and min_ratio < radius / other_radius < max_ratio

@@ -39,6 +39,13 @@ Video files store colours at half the resolution.
 _SIMILAR_RADIUS_RATIOS = (0.4, 2.5)
 """Ratios of the radii of two moving objects between which they may be taken for each other."""
 
+_MAX_RADIUS_DEVIATION = 0.2
+"""Maximum relative deviation of a radius from the linear trend along its path."""
+_REWEIGHTING_ITERATIONS = 10
+"""Number of iterations of reweighted least squares."""
+_MIN_RADIUS_UNCERTAINTY = 0.02
+"""Lower limit of the uncertainty of a radius, in pixels."""
+
 
 @dataclass
 class TrackedPath:
@@ -285,14 +292,6 @@ def _compute_median_distance(line: Array, points: Array) -> float:
     _, _, axes = np.linalg.svd(line - middle, full_matrices=False)
     distances = (points - middle) @ axes[-1]
     return float(np.median(np.abs(distances)))
-
-
-_MAX_RADIUS_DEVIATION = 0.2
-"""Maximum relative deviation of a radius from the linear trend along its path."""
-_REWEIGHTING_ITERATIONS = 10
-"""Number of iterations of reweighted least squares."""
-_MIN_RADIUS_UNCERTAINTY = 0.02
-"""Lower limit of the uncertainty of a radius, in pixels."""
 
 
 @dataclass(frozen=True)

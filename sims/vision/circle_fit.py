@@ -9,6 +9,10 @@ With d a point's distance from the centre (u, v), R the radius and n = (x - u, y
 and for the initial circle Kasa's linear fit, with doubled centre (2 u, 2 v):
 
     (4)  x^2 + y^2 = 2 u x + 2 v y + (R^2 - u^2 - v^2)
+
+For a known radius, dR in (2) is zero, and the weights are those of Geman and McClure,
+
+    (5)  1 / (1 + (rest / width)^2)^2
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.medians import compute_median
+from sims.core.noise_estimation import SIGMA_PER_MEDIAN
 from sims.core.simulator import Array
 
 Circle = tuple[float, float, float]
@@ -25,19 +30,21 @@ CircleFit = tuple[Circle, Array]
 """Circle, and each point's distance to it, > 0 outside."""
 
 _MAX_ITERATIONS = 8
-"""Maximum number of Gauss-Newton steps."""
+"""Maximum number of Gauss-Newton steps for centre and radius."""
+_MAX_CENTRE_ITERATIONS = 12
+"""Maximum number of Gauss-Newton steps for the centre alone."""
 _CONVERGED_STEP_PIXELS = 1e-3
 """Length of a step, in pixels, below which the iteration ends."""
 _ARC_STRIDE = 3
 """Number of points between the beginnings of consecutive arcs."""
 _TUKEY_WIDTH = 4.7
 """Width of Tukey's weights in standard deviations, for 95 % efficiency with normal errors."""
-_SIGMA_PER_MEDIAN = 1.4826
-"""Standard deviation of a normal distribution divided by its median absolute deviation."""
+_GEMAN_MCCLURE_WIDTH = 0.5
+"""Width of the weights (5) in pixels, with which a centre is fitted for a known radius."""
 _MIN_EDGE_NOISE = 0.15
 """Lower limit of the estimated edge noise in pixels, so that good points are not rejected."""
 _MIN_DETERMINANT = 1e-6
-"""Determinant below which the points do not determine a circle."""
+"""Determinant below which the points do not determine a circle or its centre."""
 _MIN_RADIUS = 0.5
 """Minimum radius, pixels."""
 _MAX_RADIUS = 1e4
@@ -81,7 +88,7 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
             radius = compute_median(distances)
         residuals = distances - radius  # (1)
         width = _TUKEY_WIDTH * max(
-            _SIGMA_PER_MEDIAN * compute_median(np.abs(residuals)), _MIN_EDGE_NOISE
+            SIGMA_PER_MEDIAN * compute_median(np.abs(residuals)), _MIN_EDGE_NOISE
         )
         weights = np.maximum(1 - (residuals / width) ** 2, 0.0) ** 2  # (3)
         np.maximum(distances, 1e-9, out=distances)  # the direction n divides by them
@@ -204,3 +211,43 @@ def fit_arc(points: Array) -> Circle | None:
         float(v[best] + mean[1]),
         float(radius[best]),
     )
+
+
+def fit_centre(
+    points: Array, start: tuple[float, float], radius: float
+) -> tuple[float, float] | None:
+    """Fit the centre of a circle with a known radius to most of the points by Gauss-Newton.
+
+    With their distance d from the centre and the unit vector n towards them, each step solves
+    d - radius = n . (du, dv) (2) by weighted least squares, with the weights (5).
+
+    Args:
+        points: Points (n, 2), pixels.
+        start: Initial centre (u, v), pixels.
+        radius: Known radius, pixels.
+
+    Returns:
+        The centre (u, v); None if the points do not determine it.
+    """
+    u, v = start
+    for _ in range(_MAX_CENTRE_ITERATIONS):
+        away_u = points[:, 0] - u
+        away_v = points[:, 1] - v
+        distances = np.maximum(np.hypot(away_u, away_v), 1e-9)
+        residual = distances - radius  # (1)
+        # Points off the circle hardly count.
+        weights = 1 / (1 + (residual / _GEMAN_MCCLURE_WIDTH) ** 2) ** 2  # (5)
+        rows = np.stack([away_u / distances, away_v / distances, residual])
+        normal = (rows * weights) @ rows.T
+        # Normal equations (a b; b c) (du, dv) = (p, q), solved by Cramer's rule.
+        (a, b, p), (_, c, q), _ = normal.tolist()
+        determinant = a * c - b * b
+        if determinant < _MIN_DETERMINANT:
+            return None
+        du = (c * p - b * q) / determinant
+        dv = (a * q - b * p) / determinant
+        u += du
+        v += dv
+        if abs(du) + abs(dv) < _CONVERGED_STEP_PIXELS:
+            break
+    return u, v

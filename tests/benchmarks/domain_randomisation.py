@@ -19,6 +19,7 @@ import pandas as pd
 
 from bench.benchmark.problem.experiment_config import TunerEntry, load_experiment
 from bench.benchmark.problem.experiment_recording import ObservedRuns
+from bench.benchmark.problem.targets import draw_target
 from bench.benchmark.problem.training_simulator import RandomisedSimulator
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run
@@ -56,7 +57,7 @@ def rehearsed(problem, randomised, index):
 
     seen = simulate(point[None], scenarios)[0]
     seen = seen + problem.noise * rng.standard_normal(seen.shape)
-    like = problem.draw_target("in", 0).blinded
+    like = draw_target(problem, "in", 0).blinded
     nothing = ObservedRuns((), np.empty((0, seen.shape[1])))
     fitting = ObservedRuns(scenarios, seen)
     sealed = replace(like, name=f"in-{index:03d}", fitting=fitting, held_out=nothing)
@@ -69,7 +70,7 @@ def measured(name):
     experiment = replace(experiment, calibration=None, trusted=True, salt="public", budget=BUDGET)
     problem = TuningProblem(experiment)
     widths = problem.cube.compute_training_widths()
-    world = [problem.draw_target("in", index) for index in range(TARGETS)]
+    world = [draw_target(problem, "in", index) for index in range(TARGETS)]
     met = [(target.blinded, target.truth) for target in world]
     rows = []
     for tuner in TUNERS:

@@ -16,6 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.problem.targets import draw_targets
 from bench.benchmark.problem.tuning_problem import ProposalEvaluator, TuningProblem
 from bench.benchmark.runner.run_in_worker import RunOutcome, RunRequest
 from bench.benchmark.runner.run_result_rows import build_rows
@@ -68,7 +69,7 @@ def harnessed(points, problem, is_isolated):
 
 
 def measure(problem, name):
-    target = problem.draw_targets()[0]
+    target = draw_targets(problem)[0]
     points = np.random.default_rng(0).uniform(size=(EVALUATIONS, problem.cube.dim))
     costs, ratios, scoring = [], [], []
     for _ in range(REPEATS):
@@ -96,9 +97,7 @@ def make_problems():
     load_plugins([PLUGINS / "spring.py"])
     experiment = spring_experiment(targets=1, sampling={"rate": 60.0, "samples": 400})
     spring, nothing = TuningProblem(experiment), TuningProblem(experiment)
-    fixed = spring.simulate(
-        np.full((1, 2), 0.5), spring.draw_targets()[0].blinded.fitting.scenarios
-    )
+    fixed = spring.simulate(np.full((1, 2), 0.5), draw_targets(spring)[0].blinded.fitting.scenarios)
     nothing.simulator.simulate = lambda theta, scenario: fixed
     return {"none": nothing, "spring, 400 samples": spring}
 

@@ -14,6 +14,8 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.problem.experiment_config import load_experiment
+from bench.benchmark.problem.fisher_information import compute_target_spectrum
+from bench.benchmark.problem.targets import draw_target
 from bench.benchmark.problem.tuning_problem import TuningProblem
 
 PROBLEMS = {
@@ -28,7 +30,9 @@ def identified(name, count):
     """Yield a row for each range of a problem."""
     problem = TuningProblem(load_experiment(name).chosen(targets=count))
     for kind in ("in", "wide"):
-        spectra = [problem.compute_spectrum(problem.draw_target(kind, i)) for i in range(count)]
+        spectra = [
+            compute_target_spectrum(problem, draw_target(problem, kind, i)) for i in range(count)
+        ]
         sigmas = np.array([one.sigmas for one in spectra])
         stiff = Counter(int(one.is_stiff.sum()) for one in spectra)
         shares = np.mean([one.vectors[:, -1] ** 2 for one in spectra], axis=0)

@@ -26,6 +26,7 @@ import psutil
 
 from bench.benchmark.isolation.tuner_processes import IsolatedRun, IsolatedTuner
 from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.problem.targets import draw_targets
 from bench.benchmark.problem.tuning_problem import ProposalEvaluator
 from bench.benchmark.runner import tuner_process_start
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
@@ -73,7 +74,7 @@ def timed(tuner, task, problem, target, child):
 
 def evaluation(problem, name):
     """Measure microseconds per evaluation of random search."""
-    target = problem.draw_targets()[0]
+    target = draw_targets(problem)[0]
     sealed = target.blinded
     points = np.random.default_rng(0).uniform(size=(EVALUATIONS, problem.cube.dim))
     task = Task(
@@ -112,7 +113,7 @@ def evaluation(problem, name):
 def orders(experiment, tuner):
     """Return the same run request of one simulation, in-process and isolated."""
     entry = TunerEntry(tuner, tuner)
-    target = get_problem(experiment).draw_targets()[0].blinded
+    target = draw_targets(get_problem(experiment))[0].blinded
     trusted = RunRequest("run", entry, 0, target, 1)
     return trusted, RunRequest(
         "run", entry, 0, target, 1, tuned=tuner_process_start.make_tuner_spec(entry)

@@ -32,10 +32,8 @@ from pathlib import Path
 import numpy as np
 
 import simgap
-from bench.diagnosis_benchmark.case_generation.case_sampling import (
-    find_equivalent_effects,
-    restore_conditions,
-)
+from bench.diagnosis_benchmark.case_generation.case_sampling import restore_conditions
+from bench.diagnosis_benchmark.case_generation.equivalent_effects import find_equivalent_effects
 from bench.diagnosis_benchmark.case_generation.recording_conditions import SIMULATORS
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     simulate_with_mujoco,

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.problem.experiment_config import load_experiment
+from bench.benchmark.problem.targets import draw_targets
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
 from bench.benchmark.problem.tuning_problem import ProposalEvaluator, TuningProblem
 from bench.benchmark.runner.tuner_loop import drive_tuner
@@ -138,7 +139,7 @@ class Study:
 
     def __init__(self, targets=TARGETS):
         self.problem = TuningProblem(load_experiment("ball-drop").chosen(targets=targets))
-        self.targets = self.problem.draw_targets()
+        self.targets = draw_targets(self.problem)
         self._data = {}
 
     def data(self, spread, seed):

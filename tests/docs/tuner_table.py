@@ -15,8 +15,8 @@ SET = {
     "e_i = P(e_j, a_j, s_j, r_j for j = i - k ... i - 1)": (
         r"e_i = P\left(e_j, a_j, s_j, r_j \text{ for } j = i - k, \ldots, i - 1\right)"
     ),
-    "q'' = k0 + k1 q + k3 q^3 + kf sense(q') + ku u + kd q'": (
-        r"\ddot q = k_0 + k_1 q + k_3 q^3 + k_f \operatorname{sense}(\dot q) + k_u u + k_d \dot q"
+    "q'' = k0 + k1 q + k3 q^3 + kf sign(q') + ku u + kd q'": (
+        r"\ddot q = k_0 + k_1 q + k_3 q^3 + k_f \operatorname{sign}(\dot q) + k_u u + k_d \dot q"
     ),
     "integral of w q'' = integral of w'' q, integral of w q' = -integral of w' q": (
         r"\int w \ddot q = \int \ddot w q, \quad \int w \dot q = -\int \dot w q"
@@ -69,21 +69,22 @@ SET = {
         r"\mathrm{loss} = \mathrm{mean}\, \frac{|h - \mathrm{difference}|^2}"
         r"{|\mathrm{difference}|^2 + \mathrm{relative}^2} + \lambda\, |\mathrm{weights}|^2"
     ),
-    "x - mean = d slopes + left over, by least squares in each scenario": (
-        r"x - \mathrm{mean} = d \cdot \mathrm{slopes} + \text{left over},"
+    "x - mean = d slopes + residual, by least squares in each scenario": (
+        r"x - \mathrm{mean} = d \cdot \mathrm{slopes} + \mathrm{residual},"
         r" \quad \text{by least squares in each scenario}"
     ),
-    "faith of a parameter = e / (e + s * left over), e = |slope| * spread of the parameter": (
-        r"\text{faith of a parameter} = \frac{e}{e + s \cdot \text{left over}},"
+    "reliability of a parameter = e / (e + s * residual), e = |slope| * spread of the parameter": (
+        r"\text{reliability of a parameter} = \frac{e}{e + s \cdot \mathrm{residual}},"
         r" \quad e = |\mathrm{slope}| \cdot \text{spread of the parameter}"
     ),
-    "weight = (largest faith, each parameter's scaled to the same maximum)^2, per deviation": (
-        r"\mathrm{weight} = (\text{largest faith, each parameter's scaled to the same maximum})^2"
-        r" \text{ per deviation}"
+    "weight = (largest reliability, scaled to the same maximum for each parameter)^2, per "
+    "deviation": (
+        r"\mathrm{weight} = (\text{largest reliability, scaled to the same maximum"
+        r" for each parameter})^2 \text{ per deviation}"
     ),
-    "weight of circumstances = (b / (b + s * w))^2, per deviation, with b and w the standard "
+    "weight for the scenario = (b / (b + s * w))^2, per deviation, with b and w the standard "
     "deviations between and within scenarios": (
-        r"\text{weight of circumstances} = \left(\frac{b}{b + s w}\right)^2 \text{ per deviation},"
+        r"\text{weight for the scenario} = \left(\frac{b}{b + s w}\right)^2 \text{ per deviation},"
         r" \; b, w \text{ the standard deviations between and within scenarios}"
     ),
     "y = (a + b x) / (1 + c x)": r"y = \frac{a + b x}{1 + c x}",

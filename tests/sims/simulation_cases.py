@@ -7,10 +7,10 @@ from unittest import mock
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import TrueSystem
 from bench.diagnosis_benchmark.case_generation.joint_reference import SOLVER_TOLERANCES
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     CHANNELS,
-    TrueSystem,
     simulate_with_scipy,
 )
 from sims.core.simulator import Scenario

@@ -1,4 +1,4 @@
-"""Processes of isolated tuners, seen from the harness: exchange of messages, and end."""
+"""Processes of isolated tuners, seen from the harness: messages of runs and trainings, and end."""
 
 from __future__ import annotations
 
@@ -18,15 +18,21 @@ from numpy.typing import NDArray
 from bench.benchmark.isolation import fork_server
 from bench.benchmark.isolation.cpu_affinity import AffinityController
 from bench.benchmark.isolation.message_channel import (
+    EVALUATION_SIMULATOR_FLAG,
     MAX_PROPOSAL_BYTES,
+    MAX_STATE_BYTES,
     MAX_TEXT_BYTES,
+    SIMULATE_FLAG,
     Message,
     MessageChannel,
     MessageKind,
     PeerClosedError,
     ProtocolError,
+    decode_rng_state,
+    encode_rng_state,
     pack_arrays,
     to_printable,
+    unpack_arrays,
 )
 from bench.benchmark.isolation.process_errors import (
     KilledExternallyError,
@@ -36,8 +42,11 @@ from bench.benchmark.isolation.process_errors import (
 )
 from methods.tuner import (
     Array,
+    BudgetExceededError,
     Proposal,
     Task,
+    TrainingCallback,
+    TrainingSimulator,
     TunerGenerator,
 )
 
@@ -48,12 +57,12 @@ _EXTERNAL_KILL_SIGNALS = (-9, -15)
 
 SIGKILL is also sent by the kernel if memory is exhausted.
 """
-
-
 _SHUTDOWN_TIMEOUT_SECONDS = 1.0
 """Timeout in seconds for the end of a process that has closed its pipe."""
 _REPORT_TIMEOUT_SECONDS = 1.0
 """Timeout in seconds for a process's report of the files that it has written."""
+_NO_DEADLINE = float("inf")
+"""Deadline of a training, in seconds: none."""
 _MAX_REPORTED_FILES = 1_000_000
 """Maximum reported number of files; larger reports are cut to it."""
 
@@ -462,3 +471,164 @@ class IsolatedRun:
         deadline = perf_counter() + min(self.seconds, _CLOSE_TIMEOUT_SECONDS)
         child.send(MessageKind.CLOSE, deadline=deadline)
         child.receive(deadline=deadline)
+
+
+def train_remotely(
+    child: IsolatedProcess,
+    simulator: TrainingSimulator,
+    stream: NDArray[np.uint32],
+    callback: TrainingCallback | None,
+) -> dict[str, Array]:
+    """Train a tuner in its isolated process, while this process simulates for it.
+
+    The training is started by a message. Then the tuner's messages are answered: requests of
+    simulations and reports of progress, until it sends its trained arrays.
+
+    Args:
+        child: process of the tuner.
+        simulator: training simulator, which counts the simulations.
+        stream: seed of the tuner's random generator.
+        callback: training callback; None for none.
+
+    Returns:
+        Trained arrays by name.
+
+    Raises:
+        RunEndedError: the tuner failed.
+        KilledExternallyError: its process was killed externally.
+    """
+    request = {"stream": stream.astype(np.int64), "budget": np.array(simulator.budget)}
+    child.send(
+        MessageKind.FIT,
+        *pack_arrays(request),
+        flags=callback is not None,  # whether to report progress
+        deadline=_NO_DEADLINE,
+    )
+    simulators: list[TrainingSimulator] = [simulator]
+    while True:
+        message = child.receive(MAX_STATE_BYTES, _NO_DEADLINE)
+        try:
+            if message.kind == MessageKind.WEIGHTS:
+                return unpack_arrays(message.body)
+            _handle_training_message(child, message, simulators, callback)
+        except ProtocolError as error:
+            raise RunEndedError(
+                "crashed", f"the tuner's process violated the message protocol: {error}"
+            ) from None
+
+
+def _handle_training_message(
+    child: IsolatedProcess,
+    message: Message,
+    simulators: list[TrainingSimulator],
+    callback: TrainingCallback | None,
+) -> None:
+    """Answer one message of a tuner during its training.
+
+    A report of progress is confirmed. A request of simulations is served; with
+    `EVALUATION_SIMULATOR_FLAG` it uses the simulator for evaluation, which exists only if there is
+    a callback. `SIMULATE_FLAG` is read in `_serve_simulation`.
+
+    Args:
+        child: process of the tuner.
+        message: its message.
+        simulators: training simulators that it may use; that for evaluation is added on its first
+            use.
+        callback: receives the progress; None for no progress.
+
+    Raises:
+        ProtocolError: the message is not valid here.
+    """
+    # The position of the simulator in the list: 0 for training, 1 for evaluation (flag value 1).
+    simulator_index = message.flags & EVALUATION_SIMULATOR_FLAG
+    has_known_flags = message.flags <= EVALUATION_SIMULATOR_FLAG | SIMULATE_FLAG
+    is_request = message.kind == MessageKind.TRAINING_REQUEST and has_known_flags
+    if message.kind == MessageKind.PROGRESS and callback is not None:
+        callback.epoch(*_parse_progress(message.to_document()))
+        child.send(MessageKind.DONE, deadline=_NO_DEADLINE)
+    elif is_request and (callback is not None or not simulator_index):
+        if simulator_index and callback is not None and len(simulators) == 1:
+            # `ground` is the simulator with which the callback evaluates the tuner.
+            simulators.append(callback.ground)
+        _serve_simulation(child, message, simulators[simulator_index])
+    else:
+        raise ProtocolError("it sent a message of an unexpected kind")
+
+
+def _parse_progress(document: Any) -> tuple[str, int, int, float, float]:
+    """Parse a progress message: stage, epoch, number of epochs, and two losses.
+
+    Raises:
+        ProtocolError: the message has another content.
+    """
+    try:
+        stage, epoch, epochs, loss, held_out = document
+        return to_printable(str(stage)[:80]), int(epoch), int(epochs), float(loss), float(held_out)
+    except (TypeError, ValueError, OverflowError):
+        raise ProtocolError("its report of progress is not valid") from None
+
+
+def _serve_simulation(
+    child: IsolatedProcess, message: Message, simulator: TrainingSimulator
+) -> None:
+    """Send the properties of a simulator, and simulate if the message requests it.
+
+    It serves a learned tuner that trains in an isolated process. Without `SIMULATE_FLAG` only the
+    properties are sent. A request that is not valid, or beyond the budget, is answered by a
+    refusal, and the training can continue.
+
+    Properties: `training` (2, dim) is the range in the unit cube, `scale` (C,) the scale of each
+    channel, `lengths` the number of samples of each run, `scene` the present scenario (initial
+    values and inputs).
+
+    Args:
+        child: isolated process with the tuner.
+        message: request of the tuner.
+        simulator: training simulator, which counts the simulations.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    if message.flags & SIMULATE_FLAG:
+        try:
+            arrays = _simulate_points(message, simulator)
+        except (ValueError, BudgetExceededError) as error:
+            kind = "budget" if isinstance(error, BudgetExceededError) else "value"
+            refusal = json.dumps({"kind": kind, "says": str(error)}).encode()
+            child.send(MessageKind.REFUSAL, refusal, deadline=_NO_DEADLINE)
+            return
+    properties = {
+        "training": simulator.training,
+        "scale": simulator.scale,
+        "lengths": np.array(simulator.lengths, dtype=np.int64),
+        "initial": simulator.scene.initial,
+        "inputs": simulator.scene.inputs,
+        "counts": np.array([simulator.used, simulator.budget], dtype=np.int64),
+    }
+    child.send(
+        MessageKind.PROPERTIES, *pack_arrays({**properties, **arrays}), deadline=_NO_DEADLINE
+    )
+
+
+def _simulate_points(message: Message, simulator: TrainingSimulator) -> dict[str, NDArray[Any]]:
+    """Simulate the points that an isolated tuner has requested in its training.
+
+    Args:
+        message: message with the points of the unit cube and the state of the tuner's random
+            generator.
+        simulator: training simulator.
+
+    Returns:
+        The observations, and the state of the random generator after drawing the scenario.
+
+    Raises:
+        ProtocolError: the message has no points of this dimension.
+        ValueError: the state is not that of a generator, or a point is outside the training range.
+        BudgetExceededError: more simulations are requested than the budget allows.
+    """
+    request = unpack_arrays(message.body)
+    points = request.get("points", np.empty(0))
+    if points.dtype != np.float64 or points.ndim != 2 or points.shape[1] != simulator.dim:
+        raise ProtocolError("it requested no points")
+    generator = np.random.Generator(np.random.PCG64())
+    generator.bit_generator.state = decode_rng_state(request.get("rng", np.empty(0)))
+    observations = simulator.simulate(generator, points)
+    return {"observations": observations, "rng": encode_rng_state(generator.bit_generator.state)}

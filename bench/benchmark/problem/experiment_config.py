@@ -1,14 +1,13 @@
-"""Experiment configuration: parse and check experiment files, and expand them.
+"""Experiment configuration: parse and check experiment files, and expand sweeps and suites.
 
 An experiment states which tuners are compared, on which simulator and targets, and with what
 budget. The keys of a file are the fields of `Experiment`. `Experiment.document` returns the exact
 configuration, including defaults and command-line changes; it is stored with every run.
 
-Parse the tables of an experiment file: tuners, sweeps, named effects, and a suite's version.
-
-A suite is an experiment file that names its problems with their hashes. A hash covers everything in
-the problem's file that determines its results, and the model and the recording in its folder.
-Words, and the numbers that the suite states for all its problems, are not hashed.
+A sweep stands for one experiment for each combination of its values. A suite is an experiment file
+that names its problems with their hashes. A hash covers everything in the problem's file that
+determines its results, and the model and the recording in its folder. Words, and the numbers that
+the suite states for all its problems, are not hashed.
 """
 
 from __future__ import annotations
@@ -44,6 +43,62 @@ from sims.core.toml_validation import (
 )
 from sims.core.user_messages import MAX_DESCRIPTION_LENGTH, MAX_NAME_LENGTH
 
+RANGES = ("in", "wide", "real")
+"""Origin of targets: the training range, the bounds, or a recording."""
+ISOLATION_MODES = ("run", "tuner")
+"""Lifetimes of a tuner's process: one run, or all runs of the tuner."""
+_MAX_TIMEOUT_SECONDS = 1e9
+"""Maximum finite time limit in seconds; a longer one overflows timers. Infinity means no limit."""
+_MAX_MEMORY_MIB = 10**9
+"""Maximum memory limit in MiB; no machine has more memory."""
+MAX_EXPERIMENTS = 10_000
+"""Maximum number of experiments of one file.
+
+Each one has its own folder, and all are checked before the first run.
+"""
+_RARE_KEYS = (
+    "sweep",
+    "experiments",
+    "nuisance",
+    "diagnosis",
+    "identifiable",
+    "resolution",
+    "suite",
+    "problem_hashes",
+)
+"""Keys that the stored configuration omits if they are empty."""
+SHARED_KEYS = (
+    "targets",
+    "seeds",
+    "budget",
+    "training_budget",
+    "timeout",
+    "memory",
+    "isolation",
+    "trusted",
+    "salt",
+    "suite",
+    "tuners",
+)
+"""Keys of a file with several experiments that hold for each of them."""
+_UNHASHED_KEYS = (*SHARED_KEYS, "title", "says", "identifiable", "tags")
+"""Keys that do not belong to the definition of a suite's problem: shared ones, and words."""
+_OWN_PACKAGE = "package://bench/"
+"""Prefix of model files that come with the project."""
+_INVALID_CHARACTERS = re.compile(r"[^\w.+-]+")
+"""Characters that are not valid in folder names, in tables and in command lines without quotes."""
+FixedOrRange = float | Range
+"""A number, or the range from which each scenario draws one uniformly."""
+
+
+class ParameterOverride(TypedDict, total=False):
+    """Parameter properties that an experiment may change; see `sims.core.simulator.Parameter`."""
+
+    nominal: float
+    bounds: Range
+    training: Range
+    log: bool
+
 
 @dataclass(frozen=True)
 class TunerEntry:
@@ -67,324 +122,6 @@ class TunerEntry:
         if not self.randomised:
             del table["randomised"]
         return table
-
-
-def parse_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
-    """Parse the tuner entries of an experiment file, in the order of the file.
-
-    Args:
-        path: experiment file.
-        value: value of the key ``tuners``: a table of tables by label, or a list of registered
-            names and of tables that name their tuner.
-
-    Raises:
-        InputError: the value is not valid.
-    """
-    if isinstance(value, dict):
-        tables = value.items()
-        return tuple(
-            _parse_tuner_table(path, f"tuners.{label}", label, table) for label, table in tables
-        )
-    if not isinstance(value, list):
-        raise make_error(path, "tuners", "a list of names or a table for each tuner", value)
-    entries: list[TunerEntry] = []
-    for index, item in enumerate(value):
-        entry = _parse_list_item(path, f"tuners[{index}]", item)
-        # Tables and figures distinguish tuners by label; TOML keys cannot occur twice, list items
-        # can.
-        if entry.label in [listed_entry.label for listed_entry in entries]:
-            problem = f"{entry.label} is listed twice; give one of them a label"
-            raise InputError(f"{path}: tuners: {problem}")
-        entries.append(entry)
-    return tuple(entries)
-
-
-def _parse_list_item(path: Path, key: str, item: Any) -> TunerEntry:
-    """Parse one element of a list of tuners: a name, or a table with the key ``tuner``.
-
-    The label, under which results are listed, is the key ``label``, or else the name of the tuner.
-
-    Args:
-        path: path of the experiment file, for messages.
-        key: key of the list.
-        item: the element.
-    """
-    if isinstance(item, str):
-        return TunerEntry(item, item)
-    if not isinstance(item, dict):
-        raise make_error(path, key, "a name or a table", item)
-    table = dict(item)  # a copy, so that the parsed document is not changed
-    label = table.pop("label", table.get("tuner"))
-    if not isinstance(label, str):
-        raise make_error(path, key, 'a table with tuner = "NAME"', item)
-    return _parse_tuner_table(path, key, label, table)
-
-
-def _parse_tuner_table(path: Path, entry_key: str, label: str, value: Any) -> TunerEntry:
-    """Parse the table of one tuner; a table without the key ``tuner`` uses its label as the name.
-
-    Args:
-        path: path of the experiment file, for messages.
-        entry_key: key of the table in the file, for messages.
-        label: label under which results are listed.
-        value: the table.
-    """
-    # The keys of the table are the fields of `TunerEntry`, except for the label.
-    hints = {key: hint for key, hint in get_type_hints_of(TunerEntry).items() if key != "label"}
-    table = check_entries(path, entry_key, value, hints)
-    for key in ("seeds", "budget"):
-        if table.get(key, 1) < 1:
-            raise make_error(path, f"{entry_key}.{key}", "at least 1", table[key])
-    return TunerEntry(label, table.pop("tuner", label), **table)
-
-
-_INVALID_CHARACTERS = re.compile(r"[^\w.+-]+")
-"""Characters that are not valid in folder names and in command lines without quotes."""
-MAX_EXPERIMENTS = 10_000
-"""Maximum number of experiments of one file.
-
-Each one has its own folder, and all are checked before the first run.
-"""
-
-
-def expand_documents(
-    path: Path, document: Mapping[str, Any], swept: Mapping[str, Sequence[Any]]
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Expand a sweep: yield the tables of an experiment for each combination of the swept values.
-
-    The values of the last key change fastest.
-
-    Args:
-        path: experiment file, for messages.
-        document: tables of the experiment without a sweep.
-        swept: values by key; a key within a table is joined by dots.
-
-    Yields:
-        The label, as ``budget=10,noise.x=0.1``, and the tables with these values inserted.
-
-    Raises:
-        InputError: a key has no values, two values have the same label, or there are too many
-            combinations.
-    """
-    count = prod(len(values) for values in swept.values())
-    if count > MAX_EXPERIMENTS:
-        raise InputError(
-            f"{path}: sweep: expected at most {MAX_EXPERIMENTS:,} experiments, "
-            f"found {count:.3g} combinations; sweep over fewer values, or divide the file"
-        )
-    for key, values in swept.items():
-        _check_sweep_values(path, f"sweep.{key}", values)
-    for values in product(*swept.values()):
-        # A copy is needed, because tables within the document are changed.
-        changed = deepcopy(dict(document))
-        parts = []
-        for key, value in zip(swept, values, strict=True):
-            _insert_value(path, changed, key, value)
-            parts.append(f"{key}={_format_swept_value(path, key, value)}")
-        yield ",".join(parts), changed
-
-
-def _check_sweep_values(path: Path, key: str, values: Sequence[Any]) -> None:
-    """Raise an error for a key of a sweep that has no values, or the same value twice.
-
-    `key` is the key in the file, for the message.
-    """
-    if not values:
-        raise make_error(path, key, "at least one value", values)
-    texts = [_format_swept_value(path, key, value) for value in values]
-    for text in texts:
-        if texts.count(text) > 1:  # two experiments would share one folder
-            raise InputError(f"{path}: {key}: {text} is given twice")
-
-
-def _format_swept_value(path: Path, key: str, value: Any) -> str:
-    """Return a swept value as text, for the name of its experiment and thus for its folder.
-
-    Characters that do not fit into a folder name become hyphens.
-
-    Args:
-        path: path of the experiment file, for messages.
-        key: key of the sweep.
-        value: the value.
-
-    Raises:
-        InputError: the value is a table.
-    """
-    if isinstance(value, dict):
-        raise make_error(path, key, "strings, numbers, booleans or lists of them", value)
-    if isinstance(value, list | tuple):
-        return "_".join(_format_swept_value(path, key, item) for item in value)
-    if isinstance(value, bool):  # as TOML writes it
-        return str(value).lower()
-    return _INVALID_CHARACTERS.sub("-", str(value))
-
-
-def _insert_value(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
-    """Insert a value at the position that a key such as ``noise.q`` names; tables are created.
-
-    Names that contain dots themselves are recognised if the table has them already.
-
-    Args:
-        path: path of the experiment file, for messages.
-        document: content of the file, changed in place.
-        key: key with dots.
-        value: the value.
-    """
-    table, remaining_key = document, key
-    while (name := _get_first_key(table, remaining_key)) != remaining_key:
-        table, remaining_key = table.setdefault(name, {}), remaining_key[len(name) + 1 :]
-        if not isinstance(table, dict):
-            raise InputError(f"{path}: sweep.{key}: {name} is not a table, so it has no entries")
-    table[remaining_key] = value
-
-
-def _get_first_key(table: Mapping[str, Any], key: str) -> str:
-    """Return the part of a key that names an entry of the table; effect names can contain dots."""
-    matching_names = [name for name in table if key == name or key.startswith(f"{name}.")]
-    # A part that is not in the table is a new table, or a key that later checks refuse.
-    return max(matching_names, key=len, default=key.partition(".")[0])
-
-
-_OWN_PACKAGE = "package://bench/"
-"""Prefix of model files that come with the project."""
-
-
-def compute_problem_hash(path: Path, ignored_keys: frozenset[str]) -> str:
-    """Compute the hash of a problem of a suite.
-
-    Args:
-        path: experiment file of the problem.
-        ignored_keys: keys of the file that do not belong to the problem.
-
-    Returns:
-        First 16 hexadecimal digits of the SHA-256.
-    """
-    tables = read_toml(path)
-    definition = {key: value for key, value in tables.items() if key not in ignored_keys}
-    # Line ends depend on the settings of a version-control system.
-    files = [f.read_bytes().replace(b"\r\n", b"\n") for f in _list_referenced_files(path, tables)]
-    return compute_hash(definition, *files)
-
-
-def compute_hash(tables: Mapping[str, Any], *contents: bytes) -> str:
-    """Compute the hash of tables and of the contents of files.
-
-    Returns:
-        First 16 hexadecimal digits of the SHA-256.
-    """
-    text = json.dumps(tables, sort_keys=True, default=list)
-    return hashlib.sha256(b"".join([text.encode(), *contents])).hexdigest()[:16]
-
-
-def _list_referenced_files(path: Path, tables: Mapping[str, Any]) -> Iterator[Path]:
-    """Yield the model file and the recording, if they come with the project or the problem.
-
-    Args:
-        path: path of the problem's file.
-        tables: its content.
-    """
-    model = str(tables.get("model", ""))
-    if model.startswith(_OWN_PACKAGE):
-        yield Path(str(resources.files("bench").joinpath(model.removeprefix(_OWN_PACKAGE))))
-    elif model and (path.parent / model).is_file():
-        yield path.parent / model
-    recording = str(tables.get("recording", {}).get("path", ""))
-    if recording and (path.parent / recording).is_file():
-        yield path.parent / recording
-        # The description of a recording is next to its table.
-        yield (path.parent / recording).with_suffix(".toml")
-
-
-def check_problem_hash(
-    suite: str, expected: Mapping[str, str], name: str, computed_hash: str
-) -> None:
-    """Raise an error if a problem is not the one that belongs to a suite's version.
-
-    Args:
-        suite: name and version of the suite.
-        expected: hash of each problem by its name, as the file of the suite states them.
-        name: name of the problem.
-        computed_hash: hash of the problem's present files.
-
-    Raises:
-        InputError: the hash is another one, or the suite states none.
-    """
-    if expected.get(name) != computed_hash:
-        raise InputError(
-            f"suite {suite}: problem {name} has the hash {computed_hash}, expected "
-            f"{expected.get(name, 'one in [problem_hashes]')}; a changed problem needs a new "
-            'version: raise the number in suite = "..." and write the new hash'
-        )
-
-
-def list_effect_names(*settings: Mapping[str, Any]) -> list[str]:
-    """Return the sorted names of registered effects in ``effects`` and ``fixed`` of settings."""
-    return sorted(find_named_effects(*settings) & set(effects.list_names()))
-
-
-def find_named_effects(*settings: Mapping[str, Any]) -> set[str]:
-    """Return all effect names in settings, also those that a plugin may define later.
-
-    Args:
-        settings: Settings of simulators: ``effects`` are names of effects whose coefficients are
-            tuned, ``fixed`` has fixed coefficients by name of the effect.
-    """
-    names: set[str] = set()
-    for table in settings:
-        for key in ("effects", "fixed"):
-            value = table.get(key, ())
-            # Values of a wrong type are reported by the simulator.
-            if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
-                # `viscous@elbow` is the effect `viscous` at one joint of a robot.
-                names.update(name.partition("@")[0] for name in value if isinstance(name, str))
-    return names
-
-
-__all__ = [
-    "Experiment",
-    "HeldOutConfig",
-    "RecordingSource",
-    "SamplingConfig",
-    "TunerEntry",
-    "expand_sweep",
-    "list_experiment_names",
-    "load_experiment",
-    "parse_experiment",
-]
-
-RANGES = ("in", "wide", "real")
-"""Origin of targets: the training range, the bounds, or a recording."""
-
-_MAX_TIMEOUT_SECONDS = 1e9
-"""Maximum finite time limit in seconds; a longer one overflows timers. Infinity means no limit."""
-_MAX_MEMORY_MIB = 10**9
-"""Maximum memory limit in MiB; no machine has more memory."""
-ISOLATION_MODES = ("run", "tuner")
-"""Lifetimes of a tuner's process: one run, or all runs of the tuner."""
-
-_RARE_KEYS = (
-    "sweep",
-    "experiments",
-    "nuisance",
-    "diagnosis",
-    "identifiable",
-    "resolution",
-    "suite",
-    "problem_hashes",
-)
-"""Keys that the stored configuration omits if they are empty."""
-
-FixedOrRange = float | Range
-"""A number, or the range from which each scenario draws one uniformly."""
-
-
-class ParameterOverride(TypedDict, total=False):
-    """Parameter properties that an experiment may change; see `sims.core.simulator.Parameter`."""
-
-    nominal: float
-    bounds: Range
-    training: Range
-    log: bool
 
 
 @dataclass(frozen=True)
@@ -514,7 +251,7 @@ class Experiment:
         suite: name and version of the benchmark suite that the experiment belongs to; empty for
             none.
         problem_hashes: hash by name of each of the `experiments` of a suite, or of the questions
-            of a comparison of diagnosers (`experiment_config`); a changed problem is refused.
+            of a comparison of diagnosers (`compute_problem_hash`); a changed problem is refused.
         tuners: a list of registered names, and of tables with ``tuner`` and, where two entries have
             the same, a ``label``; or a table for each by its label.
     """
@@ -728,17 +465,6 @@ class Experiment:
         return replace(self, tuners=entries_in_order)
 
 
-def check_name(text: str) -> str:
-    """Convert a text to a name that is valid in tables, file names and command lines."""
-    return re.sub(r"[^\w.+-]+", "_", text)[:60] or "robot"
-
-
-def resolve_model_path(model: str, experiment: Path) -> str:
-    """Return the path of a model file, made absolute if the file is next to the experiment file."""
-    file = experiment.parent / model
-    return str(file.resolve()) if is_existing_file(file) else model
-
-
 def list_experiment_names() -> list[str]:
     """Return the names of the experiments that come with the project."""
     folder = resources.files("bench.experiments")
@@ -789,7 +515,7 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     # The keys of a file are the fields of an experiment; their types are checked below.
     hints = {key: hint for key, hint in get_type_hints_of(Experiment).items() if key != "name"}
     check_known_names(f"entry of {path}", document, hints)
-    tuners = parse_entries(path, document.get("tuners", {}))
+    tuners = _parse_tuner_entries(path, document.get("tuners", {}))
     entries = {key: value for key, value in document.items() if key != "tuners"}
     fields = check_entries(path, "", entries, hints)
     # The simulator is a robot's model file, or a registered one, or those of named experiments.
@@ -822,11 +548,97 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     # A suite of diagnoser questions states the hash of all of them. The stored configuration of a
     # result states none, because it may select some of the questions.
     if experiment.suite and experiment.diagnosis and experiment.problem_hashes:
-        question_hash = compute_hash(
+        question_hash = _hash_tables(
             {k: document["diagnosis"].get(k) for k in ("seed", "questions")}
         )
-        check_problem_hash(experiment.suite, experiment.problem_hashes, "questions", question_hash)
+        _check_problem_hash(experiment.suite, experiment.problem_hashes, "questions", question_hash)
     return experiment
+
+
+def resolve_model_path(model: str, experiment: Path) -> str:
+    """Return the path of a model file, made absolute if the file is next to the experiment file."""
+    file = experiment.parent / model
+    return str(file.resolve()) if is_existing_file(file) else model
+
+
+def _resolve_experiment_path(name: str, experiment: Path) -> str:
+    """Return a name, or the path of an experiment file, made absolute if it is next to this one."""
+    file = experiment.parent / name
+    return str(file.resolve()) if name.endswith(".toml") and is_existing_file(file) else name
+
+
+def check_name(text: str) -> str:
+    """Convert a text to a name that is valid in tables, file names and command lines."""
+    return _INVALID_CHARACTERS.sub("_", text)[:60] or "robot"
+
+
+def _parse_tuner_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
+    """Parse the tuner entries of an experiment file, in the order of the file.
+
+    Args:
+        path: experiment file.
+        value: value of the key ``tuners``: a table of tables by label, or a list of registered
+            names and of tables that name their tuner.
+
+    Raises:
+        InputError: the value is not valid.
+    """
+    if isinstance(value, dict):
+        tables = value.items()
+        return tuple(
+            _parse_tuner_table(path, f"tuners.{label}", label, table) for label, table in tables
+        )
+    if not isinstance(value, list):
+        raise make_error(path, "tuners", "a list of names or a table for each tuner", value)
+    entries: list[TunerEntry] = []
+    for index, item in enumerate(value):
+        entry = _parse_list_item(path, f"tuners[{index}]", item)
+        # Tables and figures distinguish tuners by label; TOML keys cannot occur twice, list items
+        # can.
+        if entry.label in [listed_entry.label for listed_entry in entries]:
+            problem = f"{entry.label} is listed twice; give one of them a label"
+            raise InputError(f"{path}: tuners: {problem}")
+        entries.append(entry)
+    return tuple(entries)
+
+
+def _parse_list_item(path: Path, key: str, item: Any) -> TunerEntry:
+    """Parse one element of a list of tuners: a name, or a table with the key ``tuner``.
+
+    The label, under which results are listed, is the key ``label``, or else the name of the tuner.
+
+    Args:
+        path: path of the experiment file, for messages.
+        key: key of the list.
+        item: the element.
+    """
+    if isinstance(item, str):
+        return TunerEntry(item, item)
+    if not isinstance(item, dict):
+        raise make_error(path, key, "a name or a table", item)
+    table = dict(item)  # a copy, so that the parsed document is not changed
+    label = table.pop("label", table.get("tuner"))
+    if not isinstance(label, str):
+        raise make_error(path, key, 'a table with tuner = "NAME"', item)
+    return _parse_tuner_table(path, key, label, table)
+
+
+def _parse_tuner_table(path: Path, entry_key: str, label: str, value: Any) -> TunerEntry:
+    """Parse the table of one tuner; a table without the key ``tuner`` uses its label as the name.
+
+    Args:
+        path: path of the experiment file, for messages.
+        entry_key: key of the table in the file, for messages.
+        label: label under which results are listed.
+        value: the table.
+    """
+    # The keys of the table are the fields of `TunerEntry`, except for the label.
+    hints = {key: hint for key, hint in get_type_hints_of(TunerEntry).items() if key != "label"}
+    table = check_entries(path, entry_key, value, hints)
+    for key in ("seeds", "budget"):
+        if table.get(key, 1) < 1:
+            raise make_error(path, f"{entry_key}.{key}", "at least 1", table[key])
+    return TunerEntry(label, table.pop("tuner", label), **table)
 
 
 def expand_sweep(experiment: Experiment) -> list[Experiment]:
@@ -844,24 +656,6 @@ def expand_sweep(experiment: Experiment) -> list[Experiment]:
             for expanded in _load_named_experiments(experiment, name)
         ]
     return _expand_combinations(experiment, Path(f"{experiment.name}.toml"))
-
-
-SHARED_KEYS = (
-    "targets",
-    "seeds",
-    "budget",
-    "training_budget",
-    "timeout",
-    "memory",
-    "isolation",
-    "trusted",
-    "salt",
-    "suite",
-    "tuners",
-)
-"""Keys of a file with several experiments that hold for each of them."""
-_UNHASHED_KEYS = (*SHARED_KEYS, "title", "says", "identifiable", "tags")
-"""Keys that do not belong to the definition of a suite's problem: shared ones, and words."""
 
 
 def _load_named_experiments(suite: Experiment, name: str) -> list[Experiment]:
@@ -885,16 +679,10 @@ def _load_named_experiments(suite: Experiment, name: str) -> list[Experiment]:
     if suite.suite:
         file = find_experiment_file(name)
         problem_hash = compute_problem_hash(file, frozenset(_UNHASHED_KEYS))
-        check_problem_hash(suite.suite, suite.problem_hashes, experiment.name, problem_hash)
+        _check_problem_hash(suite.suite, suite.problem_hashes, experiment.name, problem_hash)
     # Tuners are replaced as a whole: options of one experiment may be invalid in the other.
     shared = {key: getattr(suite, key) for key in SHARED_KEYS if key != "tuners" or suite.tuners}
     return expand_sweep(experiment.chosen(**shared))
-
-
-def _resolve_experiment_path(name: str, experiment: Path) -> str:
-    """Return a name, or the path of an experiment file, made absolute if it is next to this one."""
-    file = experiment.parent / name
-    return str(file.resolve()) if name.endswith(".toml") and is_existing_file(file) else name
 
 
 def _expand_combinations(experiment: Experiment, path: Path) -> list[Experiment]:
@@ -910,9 +698,198 @@ def _expand_combinations(experiment: Experiment, path: Path) -> list[Experiment]
     # All combinations have the same targets, so that only the swept values make a difference.
     document["same_targets_as"] = experiment.same_targets_as or experiment.name
     experiments = []
-    for label, changed in expand_documents(path, document, experiment.sweep):
+    for label, changed in _iterate_swept_documents(path, document, experiment.sweep):
         if experiment.title:
             values = label.replace("=", " = ").replace(",", ", ")
             changed["title"] = f"{experiment.title} ({values})"
         experiments.append(parse_experiment(f"{experiment.name}[{label}]", changed, path))
     return experiments
+
+
+def _iterate_swept_documents(
+    path: Path, document: Mapping[str, Any], swept: Mapping[str, Sequence[Any]]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Expand a sweep: yield the tables of an experiment for each combination of the swept values.
+
+    The values of the last key change fastest.
+
+    Args:
+        path: experiment file, for messages.
+        document: tables of the experiment without a sweep.
+        swept: values by key; a key within a table is joined by dots.
+
+    Yields:
+        The label, as ``budget=10,noise.x=0.1``, and the tables with these values inserted.
+
+    Raises:
+        InputError: a key has no values, two values have the same label, or there are too many
+            combinations.
+    """
+    count = prod(len(values) for values in swept.values())
+    if count > MAX_EXPERIMENTS:
+        raise InputError(
+            f"{path}: sweep: expected at most {MAX_EXPERIMENTS:,} experiments, "
+            f"found {count:.3g} combinations; sweep over fewer values, or divide the file"
+        )
+    for key, values in swept.items():
+        _check_sweep_values(path, f"sweep.{key}", values)
+    for values in product(*swept.values()):
+        # A copy is needed, because tables within the document are changed.
+        changed = deepcopy(dict(document))
+        parts = []
+        for key, value in zip(swept, values, strict=True):
+            _insert_value(path, changed, key, value)
+            parts.append(f"{key}={_format_swept_value(path, key, value)}")
+        yield ",".join(parts), changed
+
+
+def _check_sweep_values(path: Path, key: str, values: Sequence[Any]) -> None:
+    """Raise an error for a key of a sweep that has no values, or the same value twice.
+
+    `key` is the key in the file, for the message.
+    """
+    if not values:
+        raise make_error(path, key, "at least one value", values)
+    texts = [_format_swept_value(path, key, value) for value in values]
+    for text in texts:
+        if texts.count(text) > 1:  # two experiments would share one folder
+            raise InputError(f"{path}: {key}: {text} is given twice")
+
+
+def _format_swept_value(path: Path, key: str, value: Any) -> str:
+    """Return a swept value as text, for the name of its experiment and thus for its folder.
+
+    Characters that do not fit into a folder name become hyphens.
+
+    Args:
+        path: path of the experiment file, for messages.
+        key: key of the sweep.
+        value: the value.
+
+    Raises:
+        InputError: the value is a table.
+    """
+    if isinstance(value, dict):
+        raise make_error(path, key, "strings, numbers, booleans or lists of them", value)
+    if isinstance(value, list | tuple):
+        return "_".join(_format_swept_value(path, key, item) for item in value)
+    if isinstance(value, bool):  # as TOML writes it
+        return str(value).lower()
+    return _INVALID_CHARACTERS.sub("-", str(value))
+
+
+def _insert_value(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
+    """Insert a value at the position that a key such as ``noise.q`` names; tables are created.
+
+    Names that contain dots themselves are recognised if the table has them already.
+
+    Args:
+        path: path of the experiment file, for messages.
+        document: content of the file, changed in place.
+        key: key with dots.
+        value: the value.
+    """
+    table, remaining_key = document, key
+    while (name := _get_first_key(table, remaining_key)) != remaining_key:
+        table, remaining_key = table.setdefault(name, {}), remaining_key[len(name) + 1 :]
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: sweep.{key}: {name} is not a table, so it has no entries")
+    table[remaining_key] = value
+
+
+def _get_first_key(table: Mapping[str, Any], key: str) -> str:
+    """Return the part of a key that names an entry of the table; effect names can contain dots."""
+    matching_names = [name for name in table if key == name or key.startswith(f"{name}.")]
+    # A part that is not in the table is a new table, or a key that later checks refuse.
+    return max(matching_names, key=len, default=key.partition(".")[0])
+
+
+def compute_problem_hash(path: Path, ignored_keys: frozenset[str]) -> str:
+    """Compute the hash of a problem of a suite.
+
+    Args:
+        path: experiment file of the problem.
+        ignored_keys: keys of the file that do not belong to the problem.
+
+    Returns:
+        First 16 hexadecimal digits of the SHA-256.
+    """
+    tables = read_toml(path)
+    definition = {key: value for key, value in tables.items() if key not in ignored_keys}
+    # Line ends depend on the settings of a version-control system.
+    files = [f.read_bytes().replace(b"\r\n", b"\n") for f in _list_referenced_files(path, tables)]
+    return _hash_tables(definition, *files)
+
+
+def _hash_tables(tables: Mapping[str, Any], *contents: bytes) -> str:
+    """Compute the hash of tables and of the contents of files.
+
+    Returns:
+        First 16 hexadecimal digits of the SHA-256.
+    """
+    text = json.dumps(tables, sort_keys=True, default=list)
+    return hashlib.sha256(b"".join([text.encode(), *contents])).hexdigest()[:16]
+
+
+def _list_referenced_files(path: Path, tables: Mapping[str, Any]) -> Iterator[Path]:
+    """Yield the model file and the recording, if they come with the project or the problem.
+
+    Args:
+        path: path of the problem's file.
+        tables: its content.
+    """
+    model = str(tables.get("model", ""))
+    if model.startswith(_OWN_PACKAGE):
+        yield Path(str(resources.files("bench").joinpath(model.removeprefix(_OWN_PACKAGE))))
+    elif model and (path.parent / model).is_file():
+        yield path.parent / model
+    recording = str(tables.get("recording", {}).get("path", ""))
+    if recording and (path.parent / recording).is_file():
+        yield path.parent / recording
+        # The description of a recording is next to its table.
+        yield (path.parent / recording).with_suffix(".toml")
+
+
+def _check_problem_hash(
+    suite: str, expected: Mapping[str, str], name: str, computed_hash: str
+) -> None:
+    """Raise an error if a problem is not the one that belongs to a suite's version.
+
+    Args:
+        suite: name and version of the suite.
+        expected: hash of each problem by its name, as the file of the suite states them.
+        name: name of the problem.
+        computed_hash: hash of the problem's present files.
+
+    Raises:
+        InputError: the hash is another one, or the suite states none.
+    """
+    if expected.get(name) != computed_hash:
+        raise InputError(
+            f"suite {suite}: problem {name} has the hash {computed_hash}, expected "
+            f"{expected.get(name, 'one in [problem_hashes]')}; a changed problem needs a new "
+            'version: raise the number in suite = "..." and write the new hash'
+        )
+
+
+def list_effect_names(*settings: Mapping[str, Any]) -> list[str]:
+    """Return the sorted names of registered effects in ``effects`` and ``fixed`` of settings."""
+    return sorted(find_named_effects(*settings) & set(effects.list_names()))
+
+
+def find_named_effects(*settings: Mapping[str, Any]) -> set[str]:
+    """Return all effect names in settings, also those that a plugin may define later.
+
+    Args:
+        settings: Settings of simulators: ``effects`` are names of effects whose coefficients are
+            tuned, ``fixed`` has fixed coefficients by name of the effect.
+    """
+    names: set[str] = set()
+    for table in settings:
+        for key in ("effects", "fixed"):
+            value = table.get(key, ())
+            # Values of a wrong type are reported by the simulator.
+            if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
+                # `viscous@elbow` is the effect `viscous` at one joint of a robot.
+                names.update(name.partition("@")[0] for name in value if isinstance(name, str))
+    return names

@@ -22,13 +22,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
-from bench.benchmark.problem.experiment_config import Experiment
 from sims.core.simulator import Array, Parameter
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from bench.benchmark.problem.experiment_config import Experiment
+    from bench.benchmark.problem.targets import Target
+    from bench.benchmark.problem.tuning_problem import TuningProblem
 
 STIFF_SIGMA_THRESHOLD = 0.1
 """Upper limit of the standard deviation of a stiff direction, in training ranges.
@@ -39,7 +45,7 @@ The standard deviation is the Cramer-Rao bound.
 FINITE_DIFFERENCE_STEP = 1e-4
 """Step of the central differences, in training ranges."""
 
-IDENTIFIABILITY_COLUMNS = [
+SPECTRUM_COLUMNS = [
     "experiment",
     "target",
     "range",
@@ -48,6 +54,7 @@ IDENTIFIABILITY_COLUMNS = [
     "sigma",
     "stiff",
 ]
+"""Columns of identifiability.csv, without those of the parameters."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +114,34 @@ def _compute_rms(squares: Array) -> Array:
         return np.full(len(squares), np.nan)
     rms: Array = np.sqrt(squares.mean(axis=1))
     return rms
+
+
+def compute_target_spectrum(problem: TuningProblem, target: Target) -> InformationSpectrum | None:
+    """Compute the Fisher-information spectrum of a target's data at its true parameters.
+
+    For a recording it is computed at the nominal parameters, and for the first start only, because
+    all starts have the same data.
+
+    Args:
+        problem: tuning problem of the target.
+        target: target with its true parameters.
+
+    Returns:
+        The spectrum; None if it is not requested or computed for another start.
+    """
+    # The name of the first start ends in 000.
+    is_repeated = target.truth is None and target.blinded.name != f"{target.blinded.range}-000"
+    if is_repeated or not problem.has_several_parameters:
+        return None
+    nominal = np.array([parameter.nominal for parameter in problem.cube.parameters])
+    evaluation_point = nominal if target.truth is None else target.truth
+    scenarios = target.blinded.fitting.scenarios
+
+    def simulate(theta: Array) -> Array:
+        # This bypasses `problem.simulate`, because these simulations are not part of any budget.
+        return np.concatenate([problem.simulator.simulate(theta, s) for s in scenarios], axis=1)
+
+    return compute_spectrum(simulate, evaluation_point, problem.cube.parameters, problem.scale)
 
 
 def compute_spectrum(
@@ -184,6 +219,8 @@ def build_identifiability_table(
     Returns:
         Table of eigenvalues, standard deviations and the components of each parameter.
     """
+    import pandas as pd
+
     lines = [
         [
             experiment.name,
@@ -199,4 +236,4 @@ def build_identifiability_table(
         for target, spectrum in spectra.items()
         for i in range(len(spectrum.values))
     ]
-    return pd.DataFrame(lines, columns=[*IDENTIFIABILITY_COLUMNS, *(p.name for p in parameters)])
+    return pd.DataFrame(lines, columns=[*SPECTRUM_COLUMNS, *(p.name for p in parameters)])

@@ -1,12 +1,16 @@
-"""Find what an experiment needs and this machine lacks: a data set, packages, tuners."""
+"""Find what experiments need and this machine lacks: data sets, model files, packages, tuners."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from bench.benchmark.problem.experiment_config import Experiment, expand_sweep
+from bench.benchmark.problem.experiment_config import (
+    Experiment,
+    expand_sweep,
+    list_experiment_names,
+    load_experiment,
+)
 from bench.benchmark.problem.experiment_recording import find_recording
 from bench.benchmark.problem.robot_experiment import find_model
 from bench.core.plugin_registries import PartUnavailableError, simulators, tuners
@@ -14,9 +18,6 @@ from bench.datasets import public_datasets as datasets
 from bench.datasets.public_datasets import DataSet
 from sims.core.simulator import InputError
 from sims.engines.engine_lookup import ENGINE_MODULES, missing_packages
-
-if TYPE_CHECKING:
-    from bench.datasets.public_datasets import DataSet
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ def availability(experiment: Experiment) -> Availability:
     data_set = _find_missing_data_set(experiment)
     reason = ""
     if data_set is None:
-        reason = find_missing_model_file(experiment) or _explain_missing_recording(experiment)
+        reason = explain_missing_model_file(experiment) or _explain_missing_recording(experiment)
     reason = reason or _explain_missing_simulator(experiment) or _explain_missing_engine(experiment)
     return Availability(data_set, reason, _explain_missing_tuners(experiment))
 
@@ -83,6 +84,19 @@ def leave_out_missing_problems(suite: Experiment) -> tuple[Experiment, dict[str,
     return suite.chosen(experiments=tuple(available_files)), reasons
 
 
+def list_dependent_experiments(data_set: DataSet) -> list[str]:
+    """Return the names of the project's experiments that need a data set."""
+    names = []
+    for name in list_experiment_names():
+        experiment = load_experiment(name)
+        paths = [("robot", experiment.model)]
+        if experiment.recording:
+            paths.append(("recording", experiment.recording.path))
+        if data_set in [datasets.find_providing_data_set(*path) for path in paths]:
+            names.append(name)
+    return names
+
+
 def _combine_availability(experiment: Experiment) -> Availability:
     """Combine what is missing for the experiments that this one names.
 
@@ -113,21 +127,6 @@ def _combine_availability(experiment: Experiment) -> Availability:
     return Availability(next(iter(data_sets), None), "; ".join(skipped), missing_tuners)
 
 
-def _explain_missing_simulator(experiment: Experiment) -> str:
-    """Return why the experiment's registered simulator cannot be used here.
-
-    The text is empty if it can be used, or if the simulator is not a registered one: a robot's
-    model file is checked elsewhere, and an unknown name is an error of the file.
-    """
-    if experiment.model or experiment.simulator not in simulators.names():
-        return ""
-    try:
-        simulators.get(experiment.simulator)
-    except PartUnavailableError as error:
-        return error.reason
-    return ""
-
-
 def _find_missing_data_set(experiment: Experiment) -> DataSet | None:
     """Return the data set that an experiment needs and that is missing here.
 
@@ -147,6 +146,17 @@ def _find_missing_data_set(experiment: Experiment) -> DataSet | None:
     return None
 
 
+def explain_missing_model_file(experiment: Experiment) -> str:
+    """Return why an experiment's model file is missing; empty if it exists or is not needed."""
+    if not experiment.model:
+        return ""
+    try:
+        find_model(experiment.model, experiment.name)
+    except PartUnavailableError as error:
+        return error.reason
+    return ""
+
+
 def _explain_missing_recording(experiment: Experiment) -> str:
     """Return why the recording of an experiment cannot be read here; empty if it can."""
     if not experiment.recording:
@@ -155,6 +165,21 @@ def _explain_missing_recording(experiment: Experiment) -> str:
         find_recording(experiment.recording.path)
     except InputError as error:
         return str(error)
+    return ""
+
+
+def _explain_missing_simulator(experiment: Experiment) -> str:
+    """Return why the experiment's registered simulator cannot be used here.
+
+    The text is empty if it can be used, or if the simulator is not a registered one: a robot's
+    model file is checked elsewhere, and an unknown name is an error of the file.
+    """
+    if experiment.model or experiment.simulator not in simulators.names():
+        return ""
+    try:
+        simulators.get(experiment.simulator)
+    except PartUnavailableError as error:
+        return error.reason
     return ""
 
 
@@ -199,30 +224,3 @@ def _explain_missing_tuners(experiment: Experiment) -> Mapping[str, str]:
         except PartUnavailableError as error:
             reasons[entry.label] = error.reason
     return reasons
-
-
-def list_dependent_experiments(data_set: DataSet) -> list[str]:
-    """Return the names of the project's experiments that need a data set."""
-    from bench.benchmark.problem.experiment_config import list_experiment_names, load_experiment
-    from bench.datasets.public_datasets import find_providing_data_set
-
-    names = []
-    for name in list_experiment_names():
-        experiment = load_experiment(name)
-        paths = [("robot", experiment.model)]
-        if experiment.recording:
-            paths.append(("recording", experiment.recording.path))
-        if data_set in [find_providing_data_set(*path) for path in paths]:
-            names.append(name)
-    return names
-
-
-def find_missing_model_file(experiment: Experiment) -> str:
-    """Return why an experiment's model file is missing; empty if it exists or is not needed."""
-    if not experiment.model:
-        return ""
-    try:
-        find_model(experiment.model, experiment.name)
-    except PartUnavailableError as error:
-        return error.reason
-    return ""

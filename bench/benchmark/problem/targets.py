@@ -111,6 +111,25 @@ class TargetProblem(Protocol):
         """Draw the scenarios of one target."""
 
 
+def draw_targets(problem: TargetProblem) -> list[Target]:
+    """Draw all targets of an experiment.
+
+    The ranges alternate, so that a part of the targets contains all ranges.
+
+    Args:
+        problem: problem of the experiment.
+
+    Raises:
+        InputError: all of `MAX_DRAWS` draws of a target diverge.
+    """
+    experiment = problem.experiment
+    return [
+        draw_target(problem, kind, index)
+        for index in range(experiment.targets)
+        for kind in experiment.ranges
+    ]
+
+
 def draw_target(problem: TargetProblem, kind: str, index: int) -> Target:
     """Draw one target, again if its simulation diverges.
 

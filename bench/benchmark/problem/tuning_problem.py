@@ -1,8 +1,10 @@
-"""Tuning problem of an experiment: simulator, unit cube, channels and their scale.
+"""Tuning problem of an experiment: simulator, unit cube, channels, and the loss of points.
 
-`TuningProblem` is rebuilt from the experiment in every process. Targets (`problem.targets`) are
-made in the parent process alone, which stores their true parameters. Learned tuners access the
-simulator through `bench.benchmark.problem.training_simulator`.
+`TuningProblem` has the simulator and the channels with their scale; it is rebuilt from the
+experiment in every process. `ProposalEvaluator` computes the loss of points on the runs of one
+target. Targets (`problem.targets`) are made in the parent process alone, which stores their true
+parameters. Learned tuners access the simulator through
+`bench.benchmark.problem.training_simulator`.
 """
 
 from __future__ import annotations
@@ -12,19 +14,21 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from bench.benchmark.problem import targets
 from bench.benchmark.problem.experiment_config import Experiment
-from bench.benchmark.problem.experiment_recording import RecordedRuns, load_recorded_runs
-from bench.benchmark.problem.fisher_information import InformationSpectrum, compute_spectrum
+from bench.benchmark.problem.experiment_recording import (
+    ObservedRuns,
+    RecordedRuns,
+    load_recorded_runs,
+)
 from bench.benchmark.problem.robot_experiment import (
     complete_robot_experiment,
     get_simulator_class,
 )
-from bench.benchmark.problem.targets import Target
+from bench.benchmark.problem.targets import draw_scenario
 from methods.tuner import ScenarioInfo
 from sims.core.simulator import (
     Array,
@@ -35,9 +39,6 @@ from sims.core.simulator import (
     make_unknown_name_error,
 )
 from sims.core.unit_cube import UnitCube
-
-if TYPE_CHECKING:
-    from bench.benchmark.problem.experiment_recording import ObservedRuns
 
 
 class TuningProblem:
@@ -206,7 +207,7 @@ class TuningProblem:
         if self.recording:
             return self.recording.fitting.scenarios
         experiment = self.experiment
-        return (targets.draw_scenario(experiment, rng, experiment.initial, experiment.inputs),)
+        return (draw_scenario(experiment, rng, experiment.initial, experiment.inputs),)
 
     def describe_scenarios(self, scenarios: Sequence[Scenario]) -> ScenarioInfo:
         """Return the scenario information for tuners: initial values, constants and inputs.
@@ -233,81 +234,10 @@ class TuningProblem:
             inputs.append(signals.reshape(-1, scenario.times.size).T)
         return ScenarioInfo(np.array(initial, dtype=np.float64), np.concatenate(inputs))
 
-    def draw_target(self, kind: str, index: int) -> Target:
-        """Draw one target.
-
-        It depends on the experiment's name, but not on tuners, seeds or budgets.
-
-        Args:
-            kind: range of the target.
-            index: number of the target in its range.
-        """
-        return targets.draw_target(self, kind, index)
-
-    def draw_targets(self) -> list[Target]:
-        """Draw all targets of the experiment.
-
-        The ranges alternate, so that a part of the targets contains all ranges.
-        """
-        return [
-            self.draw_target(kind, index)
-            for index in range(self.experiment.targets)
-            for kind in self.experiment.ranges
-        ]
-
     @property
     def has_several_parameters(self) -> bool:
         """True if identifiability is requested and there are several parameters."""
         return self.cube.dim > 1 and self.experiment.identifiability
-
-    def compute_spectrum(self, target: Target) -> InformationSpectrum | None:
-        """Compute the Fisher-information spectrum of a target's data at its true parameters.
-
-        For a recording it is computed at the nominal parameters, and for the first start only,
-        because all starts have the same data.
-
-        Returns:
-            The spectrum; None if it is not requested or computed for another start.
-        """
-        # The name of the first start ends in 000.
-        is_repeated = target.truth is None and target.blinded.name != f"{target.blinded.range}-000"
-        if is_repeated or not self.has_several_parameters:
-            return None
-        nominal = np.array([parameter.nominal for parameter in self.cube.parameters])
-        evaluation_point = nominal if target.truth is None else target.truth
-        scenarios = target.blinded.fitting.scenarios
-
-        def simulate(theta: Array) -> Array:
-            # This bypasses `self.simulate`, because these simulations are not part of any budget.
-            return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
-
-        return compute_spectrum(simulate, evaluation_point, self.cube.parameters, self.scale)
-
-    def compute_distance_from_training(self, truth: Array) -> float:
-        """Return the distance of true parameters from the training range.
-
-        It is the largest distance of any parameter, in units of the width of the parameter's
-        training range; 0 inside.
-
-        Args:
-            truth: (dim,) true parameters in their physical units.
-        """
-        ranges = np.array([p.training_range for p in self.cube.parameters])
-        # One of the two differences is positive outside, both are negative inside.
-        excess = np.maximum(ranges[:, 0] - truth, truth - ranges[:, 1])
-        return float(max(0.0, (excess / self.cube.compute_training_widths()).max()))
-
-
-@contextmanager
-def numeric_warnings_silenced() -> Iterator[None]:
-    """Silence NumPy's floating-point warnings and other RuntimeWarnings; also a decorator.
-
-    A simulation that overflows is a valid result: its loss is infinite, and status and report say
-    so. A warning for each of its time steps gives no further information.
-    """
-    with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        yield
 
 
 def apply_parameter_changes(
@@ -398,7 +328,7 @@ class ProposalEvaluator:
 
         Returns:
             Observations (n, T, C) and losses (n,). A failed simulation has NaN observations and an
-        infinite loss.
+            infinite loss.
         """
         observations = self._problem.simulate(points, self._scenarios)
         has_one_point_and_channel = observations.shape[0] == observations.shape[2] == 1
@@ -480,3 +410,15 @@ class ProposalEvaluator:
         if self._evaluated_squares:
             return np.concatenate(self._evaluated_squares)
         return np.empty((0, len(self._mean_factors)))
+
+
+@contextmanager
+def numeric_warnings_silenced() -> Iterator[None]:
+    """Silence NumPy's floating-point warnings and other RuntimeWarnings; also a decorator.
+
+    A simulation that overflows is a valid result: its loss is infinite, and status and report say
+    so. A warning for each of its time steps gives no further information.
+    """
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        yield

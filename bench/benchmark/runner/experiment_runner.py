@@ -17,8 +17,8 @@ from bench.benchmark.isolation.process_errors import RunEndedError
 from bench.benchmark.isolation.resource_limits import import_resource_module
 from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment_config import Experiment, TunerEntry
-from bench.benchmark.problem.fisher_information import InformationSpectrum
-from bench.benchmark.problem.targets import Redraws, Target, count_redraws
+from bench.benchmark.problem.fisher_information import InformationSpectrum, compute_target_spectrum
+from bench.benchmark.problem.targets import Redraws, Target, count_redraws, draw_targets
 from bench.benchmark.problem.tuning_problem import TuningProblem, numeric_warnings_silenced
 from bench.benchmark.runner.plugin_inspection import (
     check_classes_importable,
@@ -209,7 +209,7 @@ def prepare_experiment(experiment: Experiment, salt: str | None = None) -> Exper
     entries = [entry for entry in experiment.tuners if entry.label not in results.skipped]
     if not experiment.trusted:
         results.tuned = {entry.label: make_tuner_spec(entry) for entry in entries}
-    targets = results.problem.draw_targets()
+    targets = draw_targets(results.problem)
     results.redraws = count_redraws(experiment, targets)
     results.plan = list(_iterate_planned_runs(experiment, entries, targets))
     # Workers open their own simulators, and this process does not need one for now.
@@ -337,7 +337,7 @@ def _compute_target_spectra(results: ExperimentRun, progress: ProgressFactory) -
     targets = {planned.target.blinded.name: planned.target for planned in results.plan}
     step = progress("identifiability", len(targets))
     for name, target in targets.items():
-        if (spectrum := problem.compute_spectrum(target)) is not None:
+        if (spectrum := compute_target_spectrum(problem, target)) is not None:
             results.spectra[name] = spectrum
         step()
     # The spectra have opened the simulators; the runs do not use those of this process.
@@ -435,14 +435,14 @@ def _store_result(results: ExperimentRun, index: int, outcome: RunOutcome | Exce
     request, target = results.plan[index].request, results.plan[index].target
     if isinstance(outcome, TimeoutError):
         reason = f"killed after its limit of {problem.experiment.timeout:g} s"
-        outcome = make_unfinished_outcome(problem, target, "timeout", reason)
+        outcome = make_unfinished_outcome(problem, target.blinded, "timeout", reason)
     elif isinstance(outcome, WorkerDiedError):
-        outcome = make_unfinished_outcome(problem, target, "crashed", str(outcome))
+        outcome = make_unfinished_outcome(problem, target.blinded, "crashed", str(outcome))
     elif isinstance(outcome, RunEndedError):
-        outcome = make_unfinished_outcome(problem, target, outcome.status, outcome.reason)
+        outcome = make_unfinished_outcome(problem, target.blinded, outcome.status, outcome.reason)
     elif isinstance(outcome, Exception):
         reason = "".join(traceback.format_exception(outcome))
-        outcome = make_unfinished_outcome(problem, target, "crashed", reason)
+        outcome = make_unfinished_outcome(problem, target.blinded, "crashed", reason)
     results.notes.add(request.entry.label, outcome)
     spectrum = results.spectra.get(request.target.name)
     columns = build_rows(problem, request, target, outcome, spectrum)

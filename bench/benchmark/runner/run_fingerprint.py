@@ -1,14 +1,16 @@
-"""Fingerprint of an experiment and IDs of its runs, which change with all that determines them.
+"""Fingerprint of an experiment and ids of its runs: hashes of everything that determines a run.
 
-``cma_es/wide-017/0/3f9ac2d15b`` consists of tuner, target, seed and a hash. The hash covers the
-tuner's options, the simulator with its settings, the target's scenario and observation, budget,
-limits, code and package versions.
+* `compute_fingerprint` hashes what must not change while a study is running.
+* `RunIds` makes the id of each run. ``cma_es/wide-017/0/3f9ac2d15b`` consists of tuner, target,
+  seed and a hash, which covers the tuner's options, the simulator with its settings, the target's
+  scenario and observation, budget, limits, code and package versions.
+* The other functions hash one thing each: source folders, classes, effects, plugin files, the
+  recording and the versions of packages. The name of a file of trained weights contains these
+  hashes too.
 
-Hash everything that determines a run: code, classes, recordings and package versions.
-
-The id of a run and the name of a file of trained weights contain these hashes. If something that
-determines a run were missing here, one run or one set of weights could be mistaken for another.
-Therefore whole source folders are hashed, and a class whose source cannot be found is refused.
+If something that determines a run were missing here, one run or one set of weights could be
+mistaken for another. Therefore whole source folders are hashed, and a class whose source cannot be
+found is refused.
 """
 
 from __future__ import annotations
@@ -89,10 +91,191 @@ NUMERICAL_PACKAGES = (
     "torch",
 )
 """Numerical packages; another version of one may give other results."""
+IRRELEVANT_KEYS = {
+    "title": "descriptive text",
+    "says": "descriptive text",
+    "tags": "descriptive text",
+    "identifiable": "descriptive text",
+    "suite": "descriptive text",
+    "problem_hashes": "an experiment that is run names no other experiments",
+    "negligible_error": "used in the ranking, after all runs",
+    "identifiability": "computed separately from the runs",
+    "recording": "path of the file; its content is hashed",
+    "model": "path of the file; its content is hashed",
+    "calibration": "its result is in the settings of the tuned simulator",
+    "shot": "uses the tuned model, after the runs",
+    "diagnosis": "comparison of diagnosers, which tunes nothing",
+    "sweep": "an experiment that is run has single values",
+    "experiments": "an experiment that is run names no other experiments",
+    "nuisance": "affects randomised entries only, and is hashed with them",
+}
+"""Keys of an experiment that change neither runs nor trained weights, each with the reason."""
+RUN_IRRELEVANT_KEYS = {
+    **IRRELEVANT_KEYS,
+    "resolution": "rounds observations, which are hashed with the target",
+    "ranges": "selects targets; each run's id covers its own target",
+    "targets": "number of targets; each run's id covers its own target",
+    "same_targets_as": "selects targets; their scenarios and observations are hashed",
+    "held_out": "scenarios and observations of the held-out side are hashed with the target",
+    "seeds": "number of seeds; each run's id covers its own seed",
+    "budget": "each run's id covers its own budget, which the tuner's entry may change",
+    "training_budget": "affects learned tuners only, and is hashed with their entries",
+    "salt": "selects targets; their scenarios and observations are hashed",
+    "salt_sha256": "selects targets; their scenarios and observations are hashed",
+    "tuners": "each run's id covers its own tuner with its options",
+}
+"""Keys of an experiment that do not change any run by themselves, each with the reason."""
 _PLUGIN_MODULE_PREFIX = "simgap_plugin_"
 """Prefix of the module names of plugin files (`bench.core.plugin_registries`)."""
 _ENTRY_POINT_GROUPS = ("simgap.tuners", "simgap.simulators", "simgap.effects", "simgap.diagnosers")
 """Entry-point groups by which installed plugins register."""
+
+
+def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
+    """Hash everything that must not change while an experiment is running.
+
+    The hashes are stored with the study. When it is resumed, they are computed again, and a
+    difference is reported by its name.
+
+    Args:
+        experiment: configuration of the experiment.
+        plugins: paths of the plugin files that it needs.
+
+    Returns:
+        Hashes by readable name.
+    """
+    # The salt is secret until the end, and then revealed in the configuration. It is blanked here,
+    # so that this does not change the hash. `salt_sha256`, the commitment to the salt, is part of
+    # the configuration from the beginning.
+    public = experiment.chosen(salt="") if experiment.salt_sha256 else experiment
+    compared_parts = "diagnosers" if experiment.diagnosis else "simulator and tuners"
+    model_hash = {}
+    if experiment.model:
+        model_source = hash_class_source(get_simulator_class(experiment))
+        model_hash = {"model file": compute_digest(model_source)}
+    return {
+        "configuration": compute_digest(experiment.name, public.document()),
+        "recording": compute_digest(hash_recording(experiment)),
+        **model_hash,
+        "plugins": hash_plugin_files(plugins),
+        "code": hash_source_folders(_get_source_folders(experiment)),
+        "package versions": hash_package_versions(),
+        compared_parts: compute_digest(_hash_class_sources(experiment)),
+    }
+
+
+def _get_source_folders(experiment: Experiment) -> tuple[str, ...]:
+    """Return the source folders that determine the results of an experiment.
+
+    The result is empty for an ordinary comparison of tuners, whose folders are the default of
+    `hash_source_folders`.
+    """
+    if experiment.shot:
+        return BOUNCE_SHOT_SOURCE_FOLDERS
+    if experiment.diagnosis:
+        return DIAGNOSIS_SOURCE_FOLDERS
+    return EXPLAIN_SOURCE_FOLDERS if experiment.calibration else ()
+
+
+def _hash_class_sources(experiment: Experiment) -> list[str]:
+    """Hash the sources of the simulator and the tuners or diagnosers, one hash each.
+
+    This covers classes that a notebook defines, which are in no plugin file.
+    """
+    sources = []
+    if not experiment.diagnosis:
+        sources.append(hash_class_source(get_simulator_class(experiment)))
+    for registry, name in list_compared_parts(experiment):
+        try:
+            sources.append(hash_class_source(registry.get(name)))
+        # A skipped part has no runs yet; its hash changes when it becomes available.
+        except PartUnavailableError:
+            sources.append("skipped")
+    return sources
+
+
+def list_compared_parts(experiment: Experiment) -> list[tuple[Registry[Any], str]]:
+    """List the tuners or diagnosers that an experiment compares: registry and registered name."""
+    names = [(tuners, entry.tuner) for entry in experiment.tuners]
+    return [*names, *((diagnosers, name) for name in experiment.diagnosis.get("diagnosers", ()))]
+
+
+class RunIds:
+    """Identifiers of an experiment's runs."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        """Hash what all runs of the experiment share: configuration, simulator and code.
+
+        Tuners and targets are hashed when they are first used. `_entry_digests` and
+        `_target_digests` cache these hashes by label of the tuner and by name of the target.
+        """
+        self._experiment = experiment
+        self._common_digest = compute_digest(
+            select_relevant_keys(experiment, RUN_IRRELEVANT_KEYS),
+            hash_recording(experiment),
+            hash_class_source(get_simulator_class(experiment)),
+            hash_effect_sources(experiment.settings, experiment.world),
+            hash_source_folders(),
+            hash_package_versions(),
+        )
+        self._entry_digests: dict[str, str] = {}
+        self._target_digests: dict[str, str] = {}
+
+    def make_run_id(self, entry: TunerEntry, target: BlindedTarget, seed: int, budget: int) -> str:
+        """Return the identifier of one run: ``TUNER/TARGET/SEED/HASH``.
+
+        The hash covers all that determines the run, so that an id never stands for two different
+        runs.
+
+        Args:
+            entry: entry of the tuner.
+            target: target of the run.
+            seed: seed of the tuner.
+            budget: number of simulations.
+        """
+        # Hashes are cached, because a plan may have a million runs.
+        if entry.label not in self._entry_digests:
+            tuner_class = tuners.get(entry.tuner)
+            training_budget = self._experiment.training_budget if tuner_class.learned else 0
+            # The random effects of the training matter only for an entry that trains with them.
+            nuisance = [dict(self._experiment.nuisance)] if entry.randomised else []
+            self._entry_digests[entry.label] = compute_digest(
+                entry.tuner,
+                dict(entry.options),
+                training_budget,
+                hash_class_source(tuner_class),
+                *nuisance,
+            )
+        if target.name not in self._target_digests:
+            self._target_digests[target.name] = _hash_target(target)
+        digest = compute_digest(
+            self._common_digest,
+            self._entry_digests[entry.label],
+            self._target_digests[target.name],
+            seed,
+            budget,
+        )
+        return f"{entry.label}/{target.name}/{seed}/{digest}"
+
+
+def _hash_target(target: BlindedTarget) -> str:
+    """Hash a target's scenarios, observations and start.
+
+    Args:
+        target: Target as tuners see it, without its true parameters.
+
+    Returns:
+        Digest of scenarios and observations of the fitting and held-out runs, and of the start.
+    """
+    run_sets = [target.fitting, target.held_out]
+    scenarios = [
+        [s.times.tobytes(), s.initial, {k: v.tobytes() for k, v in s.inputs.items()}, s.constants]
+        for run_set in run_sets
+        for s in run_set.scenarios
+    ]
+    return compute_digest(
+        scenarios, [run_set.observed.tobytes() for run_set in run_sets], target.start.tobytes()
+    )
 
 
 def compute_digest(*parts: Any, length: int = 10) -> str:
@@ -110,6 +293,20 @@ def _convert_for_json(value: Any) -> Any:
     if isinstance(value, bytes):
         return hashlib.sha256(value).hexdigest()
     return dict(value) if isinstance(value, Mapping) else str(value)
+
+
+def select_relevant_keys(experiment: Experiment, irrelevant: Iterable[str]) -> dict[str, Any]:
+    """Return the fields of an experiment's configuration that affect a result, to be hashed.
+
+    Irrelevant fields are listed instead of the relevant ones, so that a new field of `Experiment`
+    counts as relevant until it is listed with a reason.
+
+    Args:
+        experiment: configuration of the experiment.
+        irrelevant: names of the fields that are left out.
+    """
+    document = experiment.document() | {"name": experiment.name}
+    return {name: value for name, value in document.items() if name not in irrelevant}
 
 
 @cache
@@ -168,39 +365,9 @@ def hash_recording(experiment: Experiment) -> str:
     return hashlib.sha256(table.read_bytes() + table.with_suffix(".toml").read_bytes()).hexdigest()
 
 
-IRRELEVANT_KEYS = {
-    "title": "descriptive text",
-    "says": "descriptive text",
-    "tags": "descriptive text",
-    "identifiable": "descriptive text",
-    "suite": "descriptive text",
-    "problem_hashes": "an experiment that is run names no other experiments",
-    "negligible_error": "used in the ranking, after all runs",
-    "identifiability": "computed separately from the runs",
-    "recording": "path of the file; its content is hashed",
-    "model": "path of the file; its content is hashed",
-    "calibration": "its result is in the settings of the tuned simulator",
-    "shot": "uses the tuned model, after the runs",
-    "diagnosis": "comparison of diagnosers, which tunes nothing",
-    "sweep": "an experiment that is run has single values",
-    "experiments": "an experiment that is run names no other experiments",
-    "nuisance": "affects randomised entries only, and is hashed with them",
-}
-"""Keys of an experiment that change neither runs nor trained weights, each with the reason."""
-
-
-def select_relevant_keys(experiment: Experiment, irrelevant: Iterable[str]) -> dict[str, Any]:
-    """Return the fields of an experiment's configuration that affect a result, to be hashed.
-
-    Irrelevant fields are listed instead of the relevant ones, so that a new field of `Experiment`
-    counts as relevant until it is listed with a reason.
-
-    Args:
-        experiment: configuration of the experiment.
-        irrelevant: names of the fields that are left out.
-    """
-    document = experiment.document() | {"name": experiment.name}
-    return {name: value for name, value in document.items() if name not in irrelevant}
+def hash_effect_sources(*settings: Mapping[str, Any]) -> list[str]:
+    """Hash the sources of effects named in simulator settings; the simulator class lacks them."""
+    return [hash_class_source(effects.get_effect(name)) for name in list_effect_names(*settings)]
 
 
 def hash_class_source(kind: type) -> str:
@@ -347,15 +514,6 @@ def _read_package_contents(kind: type, path: Path) -> Any:
     return path.name, path.read_bytes()
 
 
-def _make_source_error(kind: type) -> InputError:
-    """Make the error for a class whose source code cannot be found, so that it cannot be hashed."""
-    return InputError(
-        f"class {kind.__qualname__} of {kind.__module__}: expected a class of a module, a plugin "
-        "file or a notebook's cell, found one whose source cannot be determined; define it there "
-        "under its own name, or give it a text source_digest that changes with its content"
-    )
-
-
 @cache
 def _list_plugin_packages() -> frozenset[str]:
     """Return the top-level packages of installed plugins, including this project's own."""
@@ -363,170 +521,10 @@ def _list_plugin_packages() -> frozenset[str]:
     return frozenset(entry.module.partition(".")[0] for entry in entries)
 
 
-def hash_effect_sources(*settings: Mapping[str, Any]) -> list[str]:
-    """Hash the sources of effects named in simulator settings; the simulator class lacks them."""
-    return [hash_class_source(effects.get_effect(name)) for name in list_effect_names(*settings)]
-
-
-RUN_IRRELEVANT_KEYS = {
-    **IRRELEVANT_KEYS,
-    "resolution": "rounds observations, which are hashed with the target",
-    "ranges": "selects targets; each run's id covers its own target",
-    "targets": "number of targets; each run's id covers its own target",
-    "same_targets_as": "selects targets; their scenarios and observations are hashed",
-    "held_out": "scenarios and observations of the held-out side are hashed with the target",
-    "seeds": "number of seeds; each run's id covers its own seed",
-    "budget": "each run's id covers its own budget, which the tuner's entry may change",
-    "training_budget": "affects learned tuners only, and is hashed with their entries",
-    "salt": "selects targets; their scenarios and observations are hashed",
-    "salt_sha256": "selects targets; their scenarios and observations are hashed",
-    "tuners": "each run's id covers its own tuner with its options",
-}
-"""Keys of an experiment that do not change any run by themselves, each with the reason."""
-
-
-def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
-    """Hash everything that must not change while an experiment is running.
-
-    The hashes are stored with the study. When it is resumed, they are computed again, and a
-    difference is reported by its name.
-
-    Args:
-        experiment: configuration of the experiment.
-        plugins: paths of the plugin files that it needs.
-
-    Returns:
-        Hashes by readable name.
-    """
-    # The salt is secret until the end, and then revealed in the configuration. It is blanked here,
-    # so that this does not change the hash. `salt_sha256`, the commitment to the salt, is part of
-    # the configuration from the beginning.
-    public = experiment.chosen(salt="") if experiment.salt_sha256 else experiment
-    compared_parts = "diagnosers" if experiment.diagnosis else "simulator and tuners"
-    model_hash = {}
-    if experiment.model:
-        model_source = hash_class_source(get_simulator_class(experiment))
-        model_hash = {"model file": compute_digest(model_source)}
-    return {
-        "configuration": compute_digest(experiment.name, public.document()),
-        "recording": compute_digest(hash_recording(experiment)),
-        **model_hash,
-        "plugins": hash_plugin_files(plugins),
-        "code": hash_source_folders(_get_source_folders(experiment)),
-        "package versions": hash_package_versions(),
-        compared_parts: compute_digest(_hash_class_sources(experiment)),
-    }
-
-
-def _get_source_folders(experiment: Experiment) -> tuple[str, ...]:
-    """Return the source folders that determine the results of an experiment.
-
-    The result is empty for an ordinary comparison of tuners, whose folders are the default of
-    `hash_source_folders`.
-    """
-    if experiment.shot:
-        return BOUNCE_SHOT_SOURCE_FOLDERS
-    if experiment.diagnosis:
-        return DIAGNOSIS_SOURCE_FOLDERS
-    return EXPLAIN_SOURCE_FOLDERS if experiment.calibration else ()
-
-
-def _hash_class_sources(experiment: Experiment) -> list[str]:
-    """Hash the sources of the simulator and the tuners or diagnosers, one hash each.
-
-    This covers classes that a notebook defines, which are in no plugin file.
-    """
-    sources = []
-    if not experiment.diagnosis:
-        sources.append(hash_class_source(get_simulator_class(experiment)))
-    for registry, name in list_compared_parts(experiment):
-        try:
-            sources.append(hash_class_source(registry.get(name)))
-        # A skipped part has no runs yet; its hash changes when it becomes available.
-        except PartUnavailableError:
-            sources.append("skipped")
-    return sources
-
-
-class RunIds:
-    """Identifiers of an experiment's runs."""
-
-    def __init__(self, experiment: Experiment) -> None:
-        """Hash what all runs of the experiment share: configuration, simulator and code.
-
-        Tuners and targets are hashed when they are first used. `_entry_digests` and
-        `_target_digests` cache these hashes by label of the tuner and by name of the target.
-        """
-        self._experiment = experiment
-        self._common_digest = compute_digest(
-            select_relevant_keys(experiment, RUN_IRRELEVANT_KEYS),
-            hash_recording(experiment),
-            hash_class_source(get_simulator_class(experiment)),
-            hash_effect_sources(experiment.settings, experiment.world),
-            hash_source_folders(),
-            hash_package_versions(),
-        )
-        self._entry_digests: dict[str, str] = {}
-        self._target_digests: dict[str, str] = {}
-
-    def make_run_id(self, entry: TunerEntry, target: BlindedTarget, seed: int, budget: int) -> str:
-        """Return the identifier of one run: ``TUNER/TARGET/SEED/HASH``.
-
-        The hash covers all that determines the run, so that an id never stands for two different
-        runs.
-
-        Args:
-            entry: entry of the tuner.
-            target: target of the run.
-            seed: seed of the tuner.
-            budget: number of simulations.
-        """
-        # Hashes are cached, because a plan may have a million runs.
-        if entry.label not in self._entry_digests:
-            tuner_class = tuners.get(entry.tuner)
-            training_budget = self._experiment.training_budget if tuner_class.learned else 0
-            # The random effects of the training matter only for an entry that trains with them.
-            nuisance = [dict(self._experiment.nuisance)] if entry.randomised else []
-            self._entry_digests[entry.label] = compute_digest(
-                entry.tuner,
-                dict(entry.options),
-                training_budget,
-                hash_class_source(tuner_class),
-                *nuisance,
-            )
-        if target.name not in self._target_digests:
-            self._target_digests[target.name] = _hash_target(target)
-        digest = compute_digest(
-            self._common_digest,
-            self._entry_digests[entry.label],
-            self._target_digests[target.name],
-            seed,
-            budget,
-        )
-        return f"{entry.label}/{target.name}/{seed}/{digest}"
-
-
-def _hash_target(target: BlindedTarget) -> str:
-    """Hash a target's scenarios, observations and start.
-
-    Args:
-        target: Target as tuners see it, without its true parameters.
-
-    Returns:
-        Digest of scenarios and observations of the fitting and held-out runs, and of the start.
-    """
-    run_sets = [target.fitting, target.held_out]
-    scenarios = [
-        [s.times.tobytes(), s.initial, {k: v.tobytes() for k, v in s.inputs.items()}, s.constants]
-        for run_set in run_sets
-        for s in run_set.scenarios
-    ]
-    return compute_digest(
-        scenarios, [run_set.observed.tobytes() for run_set in run_sets], target.start.tobytes()
+def _make_source_error(kind: type) -> InputError:
+    """Make the error for a class whose source code cannot be found, so that it cannot be hashed."""
+    return InputError(
+        f"class {kind.__qualname__} of {kind.__module__}: expected a class of a module, a plugin "
+        "file or a notebook's cell, found one whose source cannot be determined; define it there "
+        "under its own name, or give it a text source_digest that changes with its content"
     )
-
-
-def list_compared_parts(experiment: Experiment) -> list[tuple[Registry[Any], str]]:
-    """List the tuners or diagnosers that an experiment compares: registry and registered name."""
-    names = [(tuners, entry.tuner) for entry in experiment.tuners]
-    return [*names, *((diagnosers, name) for name in experiment.diagnosis.get("diagnosers", ()))]

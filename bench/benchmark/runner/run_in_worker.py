@@ -1,10 +1,10 @@
-"""Execute one run on one target in a worker process.
+"""Execute one run on one target in a worker process; request and outcome of a run.
 
 Trainings are executed by `tuner_training.train_or_load`. True parameters never enter a worker: it
-gets
-`BlindedTarget`s and returns traces, which the parent process scores. Code of tuners does not enter
-it either, unless the tuners are trusted. The worker simulates, counts and measures time, and the
-tuner lives in its own process (`bench.benchmark.isolation`).
+gets `BlindedTarget`s and returns traces, which the parent process scores. Code of tuners does not
+enter it either, unless the tuners are trusted. The worker simulates, counts and measures time, and
+the tuner lives in its own process (`bench.benchmark.isolation`). The parent process makes the
+outcome of a run whose worker returns none.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from bench.benchmark.isolation.tuner_processes import (
     relocate,
 )
 from bench.benchmark.problem.experiment_config import Experiment, TunerEntry
-from bench.benchmark.problem.targets import BlindedTarget, Target
+from bench.benchmark.problem.targets import BlindedTarget
 from bench.benchmark.problem.tuning_problem import ProposalEvaluator, TuningProblem
 from bench.benchmark.runner.retry_after_kill import RepeatedRequests, retry_if_killed
 from bench.benchmark.runner.trained_weights import read_weights
@@ -268,7 +268,7 @@ def _run_isolated(
 
 
 def make_unfinished_outcome(
-    problem: TuningProblem, target: Target, status: str, reason: str
+    problem: TuningProblem, target: BlindedTarget, status: str, reason: str
 ) -> RunOutcome:
     """Make the outcome of a run that ended without a trace, as if its process was killed.
 
@@ -280,7 +280,7 @@ def make_unfinished_outcome(
         status: how the run ended, such as ``crashed`` or ``timeout``.
         reason: reason of the status.
     """
-    trace = RunTrace.make_unfinished(status, reason, target.blinded.start)
+    trace = RunTrace.make_unfinished(status, reason, target.start)
     # The errors have one row, for the start, which was not simulated.
     unknown_errors = np.full((1, len(problem.channels)), np.nan)
     return RunOutcome(trace, obs_rmse=unknown_errors, heldout_rmse=None, seconds=0.0)

@@ -1,4 +1,4 @@
-"""Score a run in the parent process, and build its result rows."""
+"""Build the result rows of a run in the parent process: errors by simulation, and its status."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def _build_parameter_columns(
         columns["param_abs_error"] = errors[:, 0]
     columns["outside"] = np.full(
         len(errors),
-        np.nan if target.truth is None else problem.compute_distance_from_training(target.truth),
+        np.nan if target.truth is None else cube.compute_distance_from_training(target.truth),
     )
     for parameter_index, parameter in enumerate(cube.parameters):
         columns[f"proposal_{parameter.name}"] = _prepend_nan(proposed[:, parameter_index])

@@ -1,4 +1,4 @@
-"""Study in a result folder: its creation, and the parts that all kinds of studies share."""
+"""Study in a result folder: its creation, its resumption, and what all kinds of studies share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.problem.targets import Redraws
-from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
+from bench.benchmark.runner.plugin_inspection import (
+    check_classes_importable,
+    load_plugins_for_experiment,
+)
 from bench.benchmark.runner.run_fingerprint import compute_fingerprint
 from bench.benchmark.runner.tuner_process_start import list_active_isolation_layers
 from bench.benchmark.storage.result_folder import (
@@ -164,6 +167,59 @@ class Study(ABC):
         return StudyOutcome(len(ends) - missing, len(ends), **why)
 
 
+def check_resumable(
+    folder: Path, configuration: FolderConfiguration, plugins: Sequence[str]
+) -> list[str]:
+    """Check that a study can be resumed, and load its plugins.
+
+    Args:
+        folder: folder of the study.
+        configuration: configuration with which the study was started.
+        plugins: additional plugin files.
+
+    Returns:
+        All plugin files that the study needs.
+
+    Raises:
+        InputError: something relevant has changed since the study was started.
+    """
+    # The study's own plugins come first and in their order, as when it was started.
+    added_paths = {str(Path(p).resolve()) for p in plugins}
+    all_plugins = configuration.plugins + sorted(added_paths - set(configuration.plugins))
+    load_plugins_for_experiment(all_plugins, configuration.experiment)
+    _check_unchanged(
+        folder,
+        configuration.fingerprint,
+        compute_fingerprint(configuration.experiment, all_plugins),
+    )
+    return all_plugins
+
+
+def _check_unchanged(folder: Path, initial: dict[str, str], present: dict[str, str]) -> None:
+    """Raise an error if the configuration of a study has changed.
+
+    Args:
+        folder: folder of the study.
+        initial: hashes by readable name when the study was started; empty if they are unknown.
+        present: present hashes, from `compute_fingerprint`.
+
+    Raises:
+        InputError: something has changed since the study was started.
+    """
+    if not initial:
+        raise InputError(
+            f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
+        )
+    # The first difference is reported: direct changes are listed before their consequences.
+    for hash_name, hashed in present.items():
+        if initial.get(hash_name) != hashed:
+            raise InputError(
+                f"{folder}: its {hash_name} changed since it was started ({initial.get(hash_name)} "
+                f"then, {hashed} now); all runs need the same configuration: restore it, or start "
+                "a new comparison"
+            )
+
+
 class PreparedStudy(NamedTuple):
     """Study whose folder is not yet written, so that a user error leaves no files behind.
 
@@ -190,9 +246,6 @@ class PreparedStudy(NamedTuple):
         Raises:
             InputError: workers could not load a class that the study needs.
         """
-        from bench.benchmark.runner.plugin_inspection import check_classes_importable
-        from bench.benchmark.runner.run_fingerprint import compute_fingerprint
-
         # This comes before the folder is created, so that a user error leaves no files behind.
         if self.jobs:
             check_classes_importable(self.experiment)
@@ -228,56 +281,3 @@ def prepare_study(
     # Without worker processes tuners run in this process, without isolation.
     experiment = experiment.chosen(trusted=experiment.trusted or not jobs)
     return PreparedStudy(free_folder, experiment, plugins, secret, jobs)
-
-
-def check_unchanged(folder: Path, initial: dict[str, str], present: dict[str, str]) -> None:
-    """Raise an error if the configuration of a study has changed.
-
-    Args:
-        folder: folder of the study.
-        initial: hashes by readable name when the study was started; empty if they are unknown.
-        present: present hashes, from `compute_fingerprint`.
-
-    Raises:
-        InputError: something has changed since the study was started.
-    """
-    if not initial:
-        raise InputError(
-            f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
-        )
-    # The first difference is reported: direct changes are listed before their consequences.
-    for hash_name, hashed in present.items():
-        if initial.get(hash_name) != hashed:
-            raise InputError(
-                f"{folder}: its {hash_name} changed since it was started ({initial.get(hash_name)} "
-                f"then, {hashed} now); all runs need the same configuration: restore it, or start "
-                "a new comparison"
-            )
-
-
-def check_resumable(
-    folder: Path, configuration: FolderConfiguration, plugins: Sequence[str]
-) -> list[str]:
-    """Check that a study can be resumed, and load its plugins.
-
-    Args:
-        folder: folder of the study.
-        configuration: configuration with which the study was started.
-        plugins: additional plugin files.
-
-    Returns:
-        All plugin files that the study needs.
-
-    Raises:
-        InputError: something relevant has changed since the study was started.
-    """
-    # The study's own plugins come first and in their order, as when it was started.
-    added_paths = {str(Path(p).resolve()) for p in plugins}
-    all_plugins = configuration.plugins + sorted(added_paths - set(configuration.plugins))
-    load_plugins_for_experiment(all_plugins, configuration.experiment)
-    check_unchanged(
-        folder,
-        configuration.fingerprint,
-        compute_fingerprint(configuration.experiment, all_plugins),
-    )
-    return all_plugins

@@ -1,4 +1,4 @@
-"""Start and reuse the isolated tuner processes of this process, with one fork server."""
+"""Start the isolated processes of tuners and diagnosers with one fork server; reuse idle ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from sims.core.simulator import InputError
 
 _MAX_WAITING_TUNERS = 8
 """Maximum number of idle tuners that wait for another run."""
-
 
 _fork_servers: dict[int, ForkServerClient] = {}
 """Fork server of this process, under the key 0; empty before the first use."""

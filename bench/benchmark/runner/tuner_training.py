@@ -8,31 +8,16 @@ same hash, so that an exchanged file is detected. Nothing is ever unpickled.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.benchmark.isolation.message_channel import (
-    EVALUATION_SIMULATOR_FLAG,
-    MAX_STATE_BYTES,
-    SIMULATE_FLAG,
-    Message,
-    MessageKind,
-    ProtocolError,
-    decode_rng_state,
-    encode_rng_state,
-    pack_arrays,
-    to_printable,
-    unpack_arrays,
-)
 from bench.benchmark.isolation.process_errors import RunEndedError
-from bench.benchmark.isolation.tuner_processes import IsolatedProcess, TunerSpec, relocate
+from bench.benchmark.isolation.tuner_processes import TunerSpec, relocate, train_remotely
 from bench.benchmark.problem.experiment_config import Experiment, TunerEntry
 from bench.benchmark.problem.robot_experiment import get_simulator_class
 from bench.benchmark.problem.training_simulator import CountedTrainingSimulator, RandomisedSimulator
@@ -60,26 +45,8 @@ from bench.benchmark.runner.trained_weights import (
 from bench.benchmark.runner.tuner_process_start import start_isolated_tuner
 from bench.core.plugin_registries import tuners
 from bench.core.random_streams import make_seed_words
-from methods.tuner import BudgetExceededError, TrainingCallback, TrainingSimulator, Tuner
+from methods.tuner import TrainingCallback, Tuner
 from sims.core.simulator import Array, InputError
-
-_NO_DEADLINE = float("inf")
-"""Deadline of a training, in seconds: none."""
-
-
-def build_tuner(entry: TunerEntry) -> Tuner:
-    """Build the tuner of an entry with its options.
-
-    Raises:
-        InputError: the tuner does not have an option, or refuses its value.
-    """
-    tuner_class = tuners.get(entry.tuner)
-    try:
-        return tuner_class(**entry.options)
-    # Python raises a TypeError for an unknown option, and tuners a ValueError for a bad value.
-    except (TypeError, ValueError) as error:
-        raise InputError(f"tuner {entry.label}: {error}") from None
-
 
 TRAINING_IRRELEVANT_KEYS = {
     **IRRELEVANT_KEYS,
@@ -100,37 +67,6 @@ TRAINING_IRRELEVANT_KEYS = {
     "tuners": "each key covers its own tuner with its options",
 }
 """Keys of an experiment that do not change trained weights, each with the reason."""
-
-
-def compute_training_key(experiment: Experiment, entry: TunerEntry, seed: int) -> str:
-    """Return the key of a training: a name with a hash of everything that determines the weights.
-
-    It is the name of the file of the weights, so that weights are reused only by an equal training.
-
-    Args:
-        experiment: configuration with the simulator, the training range and the training budget.
-        entry: tuner with its options.
-        seed: seed of the training.
-
-    Raises:
-        InputError: the source of the tuner or the simulator cannot be found.
-    """
-    simulator = get_simulator_class(experiment)
-    hashed = compute_digest(
-        select_relevant_keys(experiment, TRAINING_IRRELEVANT_KEYS),
-        hash_recording(experiment),
-        entry.tuner,
-        dict(entry.options),
-        seed,
-        [hash_class_source(tuners.get(entry.tuner)), hash_class_source(simulator)],
-        hash_effect_sources(experiment.settings),
-        hash_source_folders(),
-        hash_package_versions(),
-        # Effects with random coefficients act only if the entry trains with them.
-        *([dict(experiment.nuisance)] if entry.randomised else []),
-        length=16,
-    )
-    return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashed}"
 
 
 @dataclass(frozen=True)
@@ -265,6 +201,37 @@ def _train(
         return train_remotely(tuner.child, simulator, stream, callback)
 
 
+def compute_training_key(experiment: Experiment, entry: TunerEntry, seed: int) -> str:
+    """Return the key of a training: a name with a hash of everything that determines the weights.
+
+    It is the name of the file of the weights, so that weights are reused only by an equal training.
+
+    Args:
+        experiment: configuration with the simulator, the training range and the training budget.
+        entry: tuner with its options.
+        seed: seed of the training.
+
+    Raises:
+        InputError: the source of the tuner or the simulator cannot be found.
+    """
+    simulator = get_simulator_class(experiment)
+    hashed = compute_digest(
+        select_relevant_keys(experiment, TRAINING_IRRELEVANT_KEYS),
+        hash_recording(experiment),
+        entry.tuner,
+        dict(entry.options),
+        seed,
+        [hash_class_source(tuners.get(entry.tuner)), hash_class_source(simulator)],
+        hash_effect_sources(experiment.settings),
+        hash_source_folders(),
+        hash_package_versions(),
+        # Effects with random coefficients act only if the entry trains with them.
+        *([dict(experiment.nuisance)] if entry.randomised else []),
+        length=16,
+    )
+    return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashed}"
+
+
 def _check_weights(request: TrainingRequest, path: Path) -> None:
     """Restore the tuner from stored weights, to raise an error if it does not accept them.
 
@@ -310,162 +277,15 @@ def load_trained_tuner(entry: TunerEntry, path: Path) -> Tuner:
     return tuner
 
 
-def train_remotely(
-    child: IsolatedProcess,
-    simulator: CountedTrainingSimulator,
-    stream: NDArray[np.uint32],
-    watch: TrainingCallback | None,
-) -> dict[str, Array]:
-    """Train a tuner in its isolated process, while this process simulates for it.
-
-    The training is started by a message. Then the tuner's messages are answered: requests of
-    simulations and reports of progress, until it sends its trained arrays.
-
-    Args:
-        child: process of the tuner.
-        simulator: training simulator, which counts the simulations.
-        stream: seed of the tuner's random generator.
-        watch: training callback; None for none.
-
-    Returns:
-        Trained arrays by name.
+def build_tuner(entry: TunerEntry) -> Tuner:
+    """Build the tuner of an entry with its options.
 
     Raises:
-        RunEndedError: the tuner failed.
-        KilledExternallyError: its process was killed externally.
+        InputError: the tuner does not have an option, or refuses its value.
     """
-    request = {"stream": stream.astype(np.int64), "budget": np.array(simulator.budget)}
-    child.send(
-        MessageKind.FIT,
-        *pack_arrays(request),
-        flags=watch is not None,  # whether to report progress
-        deadline=_NO_DEADLINE,
-    )
-    simulators: list[TrainingSimulator] = [simulator]
-    while True:
-        message = child.receive(MAX_STATE_BYTES, _NO_DEADLINE)
-        try:
-            if message.kind == MessageKind.WEIGHTS:
-                return unpack_arrays(message.body)
-            _handle_message(child, message, simulators, watch)
-        except ProtocolError as error:
-            raise RunEndedError(
-                "crashed", f"the tuner's process violated the message protocol: {error}"
-            ) from None
-
-
-def _handle_message(
-    child: IsolatedProcess,
-    message: Message,
-    simulators: list[TrainingSimulator],
-    callback: TrainingCallback | None,
-) -> None:
-    """Answer one message of a tuner during its training.
-
-    A report of progress is confirmed. A request of simulations is served; with
-    `EVALUATION_SIMULATOR_FLAG` it uses the simulator for evaluation, which exists only if there is
-    a callback. `SIMULATE_FLAG` is read in `_serve_simulation`.
-
-    Args:
-        child: process of the tuner.
-        message: its message.
-        simulators: training simulators that it may use; that for evaluation is added on its first
-            use.
-        callback: receives the progress; None for no progress.
-
-    Raises:
-        ProtocolError: the message is not valid here.
-    """
-    # The position of the simulator in the list: 0 for training, 1 for evaluation (flag value 1).
-    simulator_index = message.flags & EVALUATION_SIMULATOR_FLAG
-    has_known_flags = message.flags <= EVALUATION_SIMULATOR_FLAG | SIMULATE_FLAG
-    is_request = message.kind == MessageKind.TRAINING_REQUEST and has_known_flags
-    if message.kind == MessageKind.PROGRESS and callback is not None:
-        callback.epoch(*_parse_progress(message.to_document()))
-        child.send(MessageKind.DONE, deadline=_NO_DEADLINE)
-    elif is_request and (callback is not None or not simulator_index):
-        if simulator_index and callback is not None and len(simulators) == 1:
-            # `ground` is the simulator with which the callback evaluates the tuner.
-            simulators.append(callback.ground)
-        _serve_simulation(child, message, simulators[simulator_index])
-    else:
-        raise ProtocolError("it sent a message of an unexpected kind")
-
-
-def _parse_progress(document: Any) -> tuple[str, int, int, float, float]:
-    """Parse a progress message: stage, epoch, number of epochs, and two losses.
-
-    Raises:
-        ProtocolError: the message has another content.
-    """
+    tuner_class = tuners.get(entry.tuner)
     try:
-        stage, epoch, epochs, loss, held_out = document
-        return to_printable(str(stage)[:80]), int(epoch), int(epochs), float(loss), float(held_out)
-    except (TypeError, ValueError, OverflowError):
-        raise ProtocolError("its report of progress is not valid") from None
-
-
-def _serve_simulation(
-    child: IsolatedProcess, message: Message, simulator: TrainingSimulator
-) -> None:
-    """Send the properties of a simulator, and simulate if the message requests it.
-
-    It serves a learned tuner that trains in an isolated process. Without `SIMULATE_FLAG` only the
-    properties are sent. A request that is not valid, or beyond the budget, is answered by a
-    refusal, and the training can continue.
-
-    Properties: `training` (2, dim) is the range in the unit cube, `scale` (C,) the scale of each
-    channel, `lengths` the number of samples of each run, `scene` the present scenario (initial
-    values and inputs).
-
-    Args:
-        child: isolated process with the tuner.
-        message: request of the tuner.
-        simulator: training simulator, which counts the simulations.
-    """
-    arrays: dict[str, NDArray[Any]] = {}
-    if message.flags & SIMULATE_FLAG:
-        try:
-            arrays = _simulate_points(message, simulator)
-        except (ValueError, BudgetExceededError) as error:
-            kind = "budget" if isinstance(error, BudgetExceededError) else "value"
-            refusal = json.dumps({"kind": kind, "says": str(error)}).encode()
-            child.send(MessageKind.REFUSAL, refusal, deadline=_NO_DEADLINE)
-            return
-    properties = {
-        "training": simulator.training,
-        "scale": simulator.scale,
-        "lengths": np.array(simulator.lengths, dtype=np.int64),
-        "initial": simulator.scene.initial,
-        "inputs": simulator.scene.inputs,
-        "counts": np.array([simulator.used, simulator.budget], dtype=np.int64),
-    }
-    child.send(
-        MessageKind.PROPERTIES, *pack_arrays({**properties, **arrays}), deadline=_NO_DEADLINE
-    )
-
-
-def _simulate_points(message: Message, simulator: TrainingSimulator) -> dict[str, NDArray[Any]]:
-    """Simulate the points that an isolated tuner has requested in its training.
-
-    Args:
-        message: message with the points of the unit cube and the state of the tuner's random
-            generator.
-        simulator: training simulator.
-
-    Returns:
-        The observations, and the state of the random generator after drawing the scenario.
-
-    Raises:
-        ProtocolError: the message has no points of this dimension.
-        ValueError: the state is not that of a generator, or a point is outside the training range.
-        BudgetExceededError: more simulations are requested than the budget allows.
-    """
-    request = unpack_arrays(message.body)
-    points = request.get("points", np.empty(0))
-    if points.dtype != np.float64 or points.ndim != 2 or points.shape[1] != simulator.dim:
-        raise ProtocolError("it requested no points")
-    generator = np.random.Generator(np.random.PCG64())
-    generator.bit_generator.state = decode_rng_state(request.get("rng", np.empty(0)))
-    observations = simulator.simulate(generator, points)
-    return {"observations": observations, "rng": encode_rng_state(generator.bit_generator.state)}
+        return tuner_class(**entry.options)
+    # Python raises a TypeError for an unknown option, and tuners a ValueError for a bad value.
+    except (TypeError, ValueError) as error:
+        raise InputError(f"tuner {entry.label}: {error}") from None

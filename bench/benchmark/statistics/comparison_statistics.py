@@ -24,12 +24,10 @@ from bench.benchmark.statistics.expected_running_time import (
 )
 from bench.benchmark.statistics.paired_tests import compare_all_pairs
 from bench.benchmark.statistics.training_amortisation import (
-    BREAK_EVEN_COLUMNS,
-    TARGETS_PER_TRAINING,
     TuningCost,
-    build_break_even_table,
+    build_break_even_tables,
+    build_fastest_tuner_table,
     compute_tuning_costs,
-    find_cheapest_tuners,
 )
 from bench.benchmark.statistics.tuner_ranking import (
     rank_after_budget,
@@ -337,9 +335,6 @@ def add_salt_column(frame: pd.DataFrame, experiment: Experiment) -> pd.DataFrame
     return frame.assign(salt="secret" if experiment.salt_sha256 else "public")
 
 
-WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
-
-
 def build_tables(
     stored: StoredComparison, statistics: ComparisonStatistics | None = None
 ) -> dict[str, pd.DataFrame]:
@@ -364,41 +359,7 @@ def build_tables(
         "ert": statistics.sort_rows(statistics.running_times),
         "ranking": statistics.ranking,
         "pairs": compare_all_pairs(statistics.curves, statistics.floor),
-        "break_even": _build_break_even_rows(experiment.name, statistics),
-        "who_wins": _build_fastest_tuner_table(experiment.name, statistics),
+        "break_even": build_break_even_tables(experiment.name, statistics.tuning_costs),
+        "who_wins": build_fastest_tuner_table(experiment.name, statistics.tuning_costs),
     }
     return {name: add_trust_column(frame, experiment) for name, frame in frames.items()}
-
-
-def _build_break_even_rows(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
-    """Build the table of break-even targets for all priced thresholds and ranges.
-
-    It says from how many targets on the training of a learned tuner costs less than a search.
-    """
-    parts = [
-        build_break_even_table(experiment, kind, level, by_tuner)
-        for level, ranges in statistics.tuning_costs.items()
-        for kind, by_tuner in ranges.items()
-    ]
-    # Concatenation with an empty part would change numeric columns to object columns.
-    parts = [part for part in parts if len(part)]
-    return pd.concat(parts) if parts else pd.DataFrame(columns=BREAK_EVEN_COLUMNS)
-
-
-def _build_fastest_tuner_table(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
-    """Build the table of the fastest tuner by duration of one simulation, per threshold and range.
-
-    A training is shared by `TARGETS_PER_TRAINING` targets. Each row has the bounds of the duration
-    in seconds, and the tuner that needs the least time between them.
-
-    Args:
-        experiment: name of the experiment.
-        statistics: statistics of the comparison, with the costs of the tuners.
-    """
-    lines = [
-        (experiment, kind, level, *line)
-        for level, ranges in statistics.tuning_costs.items()
-        for kind, by_tuner in ranges.items()
-        for line in find_cheapest_tuners(by_tuner, TARGETS_PER_TRAINING)
-    ]
-    return pd.DataFrame(lines, columns=WINNER_COLUMNS)

@@ -1,4 +1,4 @@
-"""Error against number of simulations: of all runs, as table, and as medians with intervals.
+"""Error against number of simulations: of all runs, as tables, and as medians with intervals.
 
 All statistics of a comparison start from the matrices of all runs (`RunCurves`).
 
@@ -8,7 +8,7 @@ of the mean over targets (Efron & Tibshirani 1993, ch. 13). Seeds of one target 
 counted as independent evidence.
 
 Errors are given against the number of simulations and against the target's distance from the
-training range.
+training range. Rankings and paired tests use the logarithms of errors by target and tuner.
 """
 
 from __future__ import annotations
@@ -33,9 +33,55 @@ from sims.core.simulator import Array
 
 MIN_ERROR = 1e-12
 """Errors below this value count as equal, because they consist of rounding."""
-
 _FAILED_RUN_LOG_ERROR = 1e3
 """Logarithm that represents a failed run: larger than any error, and equal for all failures."""
+RUN_KEY_COLUMNS = ["run", "experiment", "tuner", "range", "target", "seed"]
+"""Columns that are equal in all rows of one run."""
+CHECKPOINTS = (0, 1, 2, 3, 5, 10, 20, 50, 100)
+"""Numbers of simulations that are used in tables and on axes."""
+ERROR_TABLE_COLUMNS = [
+    "experiment",
+    "tuner",
+    "range",
+    "simulations",
+    "metric",
+    "median",
+    "mean",
+    "low",
+    "high",
+    "runs",
+    "failures",
+    "fit_simulations",
+    "fit_seconds",
+    "tuner_seconds",
+    "simulator_seconds",
+]
+MEDIAN_COLUMNS = ["tuner", "simulations", "median", "low", "high", "targets"]
+DISTANCE_COLUMNS = [
+    "simulations",
+    "tuner",
+    "bin",
+    "beyond",
+    "to",
+    "targets",
+    "median",
+    "low",
+    "high",
+]
+_MAX_GROUPS = 4
+"""Maximum number of groups of targets outside the training range."""
+_MIN_GROUP_SIZE = 4
+"""Minimum number of targets in a group outside the training range.
+
+A group can be smaller if there are fewer targets in total. The interval of a smaller group would
+say little.
+"""
+_BOOTSTRAP_RESAMPLES = 500
+"""Number of bootstrap resamples; enough for an interval band a few pixels wide."""
+_CURVE_POINT_COUNT = 40
+"""Number of points of a curve, on a logarithmic scale of simulations."""
+_DISTANCE_CHECKPOINTS = (3, 10)
+"""Numbers of simulations for plots of error against distance, in addition to the whole budget."""
 
 
 @dataclass(frozen=True)
@@ -104,10 +150,6 @@ class RunCurves:
     def compute_final_values(self) -> Array:
         """Return the metric after all simulations, shape (R,); see `after`."""
         return self.after(-1)
-
-
-RUN_KEY_COLUMNS = ["run", "experiment", "tuner", "range", "target", "seed"]
-"""Columns that are equal in all rows of one run."""
 
 
 class RunRowTable:
@@ -233,25 +275,42 @@ def select_primary_metric(runs: pd.DataFrame) -> PrimaryMetric:
     return PrimaryMetric(metric, runs, metric == "param_error")
 
 
-CHECKPOINTS = (0, 1, 2, 3, 5, 10, 20, 50, 100)
-"""Numbers of simulations that are used in tables and on axes."""
-ERROR_TABLE_COLUMNS = [
-    "experiment",
-    "tuner",
-    "range",
-    "simulations",
-    "metric",
-    "median",
-    "mean",
-    "low",
-    "high",
-    "runs",
-    "failures",
-    "fit_simulations",
-    "fit_seconds",
-    "tuner_seconds",
-    "simulator_seconds",
-]
+def build_log_error_table(curves: RunCurves, k: int = -1, floor: float = MIN_ERROR) -> pd.DataFrame:
+    """Compute the logarithms of errors after k simulations, by target and tuner.
+
+    The mean over seeds is taken first. A failure in one seed makes it infinite, so the tuner counts
+    as failed on this target.
+
+    Args:
+        curves: error of every run.
+        k: number of simulations; -1 for all.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        Table with one row per target and one column per tuner.
+    """
+    columns = {}
+    for tuner in curves.list_tuners():
+        tuner_curves = curves.select(tuner=tuner)
+        names, groups = tuner_curves.group_by_target()
+        errors = average_over_seeds(tuner_curves.after(k), groups)
+        columns[tuner] = pd.Series(compute_log_errors(errors, floor), index=names)
+    return pd.DataFrame(columns)
+
+
+def compute_log_errors(errors: Array, floor: float = MIN_ERROR) -> Array:
+    """Return logarithms of errors (n,); errors below `floor` count as equal to it.
+
+    An infinite error, as of a failed run, becomes a number that is larger than any error.
+
+    Args:
+        errors: (n,) errors.
+        floor: smallest error that is distinguished.
+    """
+    logs: Array = np.where(
+        np.isinf(errors), _FAILED_RUN_LOG_ERROR, np.log(np.maximum(errors, floor))
+    )
+    return logs
 
 
 def select_checkpoints(budget: int) -> list[int]:
@@ -371,34 +430,6 @@ def build_summary(
     part = table[(table["metric"] == metric) & (table["range"] == kind)]
     medians = part.pivot(index="tuner", columns="simulations", values="median")
     return medians.reindex([tuner for tuner in order if tuner in medians.index])
-
-
-MEDIAN_COLUMNS = ["tuner", "simulations", "median", "low", "high", "targets"]
-DISTANCE_COLUMNS = [
-    "simulations",
-    "tuner",
-    "bin",
-    "beyond",
-    "to",
-    "targets",
-    "median",
-    "low",
-    "high",
-]
-_MAX_GROUPS = 4
-"""Maximum number of groups of targets outside the training range."""
-_MIN_GROUP_SIZE = 4
-"""Minimum number of targets in a group outside the training range.
-
-A group can be smaller if there are fewer targets in total. The interval of a smaller group would
-say little.
-"""
-_BOOTSTRAP_RESAMPLES = 500
-"""Number of bootstrap resamples; enough for an interval band a few pixels wide."""
-_CURVE_POINT_COUNT = 40
-"""Number of points of a curve, on a logarithmic scale of simulations."""
-_DISTANCE_CHECKPOINTS = (3, 10)
-"""Numbers of simulations for plots of error against distance, in addition to the whole budget."""
 
 
 def select_curve_points(budget: int) -> list[int]:
@@ -531,41 +562,3 @@ def _compute_median_with_interval(
         values[:, None], compute_resampled_medians, *names, resamples=_BOOTSTRAP_RESAMPLES
     )
     return float(np.median(values)), float(low[0]), float(high[0])
-
-
-def build_log_error_table(curves: RunCurves, k: int = -1, floor: float = MIN_ERROR) -> pd.DataFrame:
-    """Compute the logarithms of errors after k simulations, by target and tuner.
-
-    The mean over seeds is taken first. A failure in one seed makes it infinite, so the tuner counts
-    as failed on this target.
-
-    Args:
-        curves: error of every run.
-        k: number of simulations; -1 for all.
-        floor: errors below this value count as equal to it.
-
-    Returns:
-        Table with one row per target and one column per tuner.
-    """
-    columns = {}
-    for tuner in curves.list_tuners():
-        tuner_curves = curves.select(tuner=tuner)
-        names, groups = tuner_curves.group_by_target()
-        errors = average_over_seeds(tuner_curves.after(k), groups)
-        columns[tuner] = pd.Series(compute_log_errors(errors, floor), index=names)
-    return pd.DataFrame(columns)
-
-
-def compute_log_errors(errors: Array, floor: float = MIN_ERROR) -> Array:
-    """Return logarithms of errors (n,); errors below `floor` count as equal to it.
-
-    An infinite error, as of a failed run, becomes a number that is larger than any error.
-
-    Args:
-        errors: (n,) errors.
-        floor: smallest error that is distinguished.
-    """
-    logs: Array = np.where(
-        np.isinf(errors), _FAILED_RUN_LOG_ERROR, np.log(np.maximum(errors, floor))
-    )
-    return logs

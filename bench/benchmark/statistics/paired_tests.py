@@ -1,8 +1,8 @@
-"""Paired tests of tuners over targets with effect sizes.
+"""Paired tests of tuners over targets with effect sizes, and of diagnosers over cases.
 
 Sources: F. Wilcoxon, Biometrics Bulletin 1(6), 1945 (scipy); S. Holm, Scand. J. Statist. 6, 65,
 1979; D. S. Kerby, Comprehensive Psychology 3, 2014, for the matched-pairs rank-biserial
-correlation.
+correlation; Q. McNemar, Psychometrika 12, 153, 1947, for the answers of two diagnosers.
 """
 
 from __future__ import annotations
@@ -14,11 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.statistics.error_curves import (
-    MIN_ERROR,
-    RunCurves,
-    build_log_error_table,
-)
+from bench.benchmark.statistics.error_curves import MIN_ERROR, RunCurves, build_log_error_table
 from sims.core.simulator import Array
 
 PAIR_COLUMNS = [
@@ -61,21 +57,6 @@ def compare_all_pairs(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFra
             part["p_holm"] = correct_holm(part["p_value"].to_numpy())
             tables.append(part)
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=PAIR_COLUMNS)
-
-
-def correct_holm(p: Array) -> Array:
-    """Apply the Holm correction to the p-values (n,) of one family of tests.
-
-    It bounds the probability of any false rejection in the family. The k-th smallest p-value is
-    multiplied by n + 1 - k; a corrected value is at least as large as the one before it. NaN, for
-    a test that was not possible, stays NaN and does not count.
-    """
-    # statsmodels' `multipletests` takes a second to import and collects all garbage in each call.
-    order = np.argsort(p)[: np.count_nonzero(~np.isnan(p))]
-    corrected: Array = np.full(len(p), np.nan)
-    multiplied = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))
-    corrected[order] = np.minimum(multiplied, 1.0)
-    return corrected
 
 
 class PairedTest(NamedTuple):
@@ -130,17 +111,32 @@ def compare_pair(a: Array, b: Array) -> PairedTest:
 
 
 def compute_mcnemar_p_value(first_only: int, second_only: int) -> float:
-    """Compute the p-value of McNemar's exact test, two-sided: are two diagnosers equally good?
+    """Compute the p-value of McNemar's exact test, two-sided: are two methods equally good?
 
     If they are, each case that only one of them answered correctly is as likely to be the first
     one's as the second one's. Without such cases the p-value is 1.
 
     Args:
-        first_only: number of cases that only the first diagnoser answered correctly.
-        second_only: number of cases that only the second diagnoser answered correctly.
+        first_only: number of cases that only the first method answered correctly.
+        second_only: number of cases that only the second method answered correctly.
     """
     from scipy.stats import binomtest
 
     if first_only + second_only:
         return float(binomtest(first_only, first_only + second_only).pvalue)
     return 1.0
+
+
+def correct_holm(p: Array) -> Array:
+    """Apply the Holm correction to the p-values (n,) of one family of tests.
+
+    It bounds the probability of any false rejection in the family. The k-th smallest p-value is
+    multiplied by n + 1 - k; a corrected value is at least as large as the one before it. NaN, for
+    a test that was not possible, stays NaN and does not count.
+    """
+    # statsmodels' `multipletests` takes a second to import and collects all garbage in each call.
+    order = np.argsort(p)[: np.count_nonzero(~np.isnan(p))]
+    corrected: Array = np.full(len(p), np.nan)
+    multiplied = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))
+    corrected[order] = np.minimum(multiplied, 1.0)
+    return corrected

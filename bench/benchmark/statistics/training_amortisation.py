@@ -2,15 +2,14 @@
 
 A learned tuner has a training cost, which is paid once, and a small cost for each target.
 `compute_break_even_targets` computes the number of targets from which its total number of
-simulations is below the
-one of a search tuner. `find_cheapest_tuners` finds the tuner that needs the least time when a
-simulation takes c seconds.
+simulations is below the one of a search tuner. `find_cheapest_tuners` finds the tuner that needs
+the least time when a simulation takes c seconds.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +35,7 @@ BREAK_EVEN_COLUMNS = [
     "low",
     "high",
 ]
+WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
 SIMULATION_COST_GRID: Array = np.logspace(-6, 3, 181)
 """Durations of one simulation for which tuners are compared, in seconds."""
 AT_ONCE, NEVER = 10**-0.5, 10**4.5
@@ -121,6 +121,33 @@ def compute_tuning_costs(
     return result
 
 
+def split_by_training(
+    costs_by_range: Mapping[str, Mapping[str, TuningCost]], order: Sequence[str]
+) -> tuple[list[str], list[str]]:
+    """List the untrained tuners, and the trained ones that reach an error in some range.
+
+    Args:
+        costs_by_range: cost of every tuner to reach the error, by range, by tuner.
+        order: tuners in the order of the ranking.
+
+    Returns:
+        Untrained tuners and trained tuners, each list in the order of the ranking.
+    """
+    untrained, trained = [], []
+    for tuner in order:
+        costs = [by_tuner[tuner] for by_tuner in costs_by_range.values() if tuner in by_tuner]
+        # A tuner without a run has no costs, and is in neither list.
+        if not costs:
+            continue
+        # Only a training uses simulations before the first target (`fit_simulations`).
+        if not any(cost.fit_simulations for cost in costs):
+            untrained.append(tuner)
+        # The expected running time (ERT) is infinite if no run reaches the error.
+        elif any(cost.effort.compute_ert() < float("inf") for cost in costs):
+            trained.append(tuner)
+    return untrained, trained
+
+
 def compute_break_even_targets(
     learned: TuningCost, search: TuningCost, picked: NDArray[np.int64] | None = None
 ) -> Array:
@@ -203,6 +230,30 @@ def build_break_even_table(
     return pd.DataFrame(lines, columns=BREAK_EVEN_COLUMNS)
 
 
+def build_break_even_tables(
+    experiment: str, tuning_costs: Mapping[float, Mapping[str, Mapping[str, TuningCost]]]
+) -> pd.DataFrame:
+    """Build the table of break-even targets for all thresholds and ranges.
+
+    It says from how many targets on the training of a learned tuner costs less than a search.
+
+    Args:
+        experiment: name of the experiment.
+        tuning_costs: cost of every tuner by error threshold, by range, by tuner.
+
+    Returns:
+        Table with the columns `BREAK_EVEN_COLUMNS`.
+    """
+    parts = [
+        build_break_even_table(experiment, kind, level, by_tuner)
+        for level, ranges in tuning_costs.items()
+        for kind, by_tuner in ranges.items()
+    ]
+    # Concatenation with an empty part would change numeric columns to object columns.
+    parts = [part for part in parts if len(part)]
+    return pd.concat(parts) if parts else pd.DataFrame(columns=BREAK_EVEN_COLUMNS)
+
+
 def find_cheapest_tuners(
     costs_by_tuner: Mapping[str, TuningCost], targets: float
 ) -> list[tuple[float, float, str]]:
@@ -244,6 +295,30 @@ def find_cheapest_tuners(
         )
         for first, last in itertools.pairwise(edges)
     ]
+
+
+def build_fastest_tuner_table(
+    experiment: str, tuning_costs: Mapping[float, Mapping[str, Mapping[str, TuningCost]]]
+) -> pd.DataFrame:
+    """Build the table of the fastest tuner by duration of one simulation, per threshold and range.
+
+    A training is shared by `TARGETS_PER_TRAINING` targets. Each row has the bounds of the duration
+    in seconds, and the tuner that needs the least time between them.
+
+    Args:
+        experiment: name of the experiment.
+        tuning_costs: cost of every tuner by error threshold, by range, by tuner.
+
+    Returns:
+        Table with the columns `WINNER_COLUMNS`.
+    """
+    lines = [
+        (experiment, kind, level, *line)
+        for level, ranges in tuning_costs.items()
+        for kind, by_tuner in ranges.items()
+        for line in find_cheapest_tuners(by_tuner, TARGETS_PER_TRAINING)
+    ]
+    return pd.DataFrame(lines, columns=WINNER_COLUMNS)
 
 
 def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) -> pd.DataFrame:

@@ -72,6 +72,14 @@ BEST, EQUAL, UNDECIDED, WORSE, FAILED = "best", "equal", "not decided", "worse",
 `BEST`: first of the ranking. `EQUAL`: same rank as the first and not worse. `UNDECIDED`: lower
 rank, but the test does not decide. `WORSE`: the test decides. `FAILED`: all runs failed.
 """
+MIN_PROBLEMS_FOR_RANKS = 5
+"""Minimum number of problems for mean ranks."""
+BOOTSTRAP_RESAMPLES = 500
+"""Number of bootstrap resamples of the targets for an interval."""
+PERMUTATION_COUNT = 9999
+"""Number of random permutations of the conditions for a p-value."""
+HALF_SPLIT_COUNT = 200
+"""Number of random splits of the targets into halves, for the agreement of one condition."""
 
 
 def list_ranking_points(budget: int) -> list[int]:
@@ -237,10 +245,6 @@ def _compute_median_error(logs: pd.Series[float]) -> float:
     return float(np.exp(middle)) if middle < _NO_ERROR else np.inf
 
 
-MIN_PROBLEMS_FOR_RANKS = 5
-"""Minimum number of problems for mean ranks."""
-
-
 def compute_problem_ranks(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFrame:
     """Rank tuners on each problem by their median error over targets.
 
@@ -288,12 +292,25 @@ def compute_nemenyi_p_values(ranked: pd.DataFrame) -> tuple[float, pd.DataFrame]
     return float(friedmanchisquare(*ranked.to_numpy().T).pvalue), table
 
 
-BOOTSTRAP_RESAMPLES = 500
-"""Number of bootstrap resamples of the targets for an interval."""
-PERMUTATION_COUNT = 9999
-"""Number of random permutations of the conditions for a p-value."""
-HALF_SPLIT_COUNT = 200
-"""Number of random splits of the targets into halves, for the agreement of one condition."""
+def compute_friedman_p_value(errors: Array) -> float:
+    """Compute the p-value of Friedman's test that all tuners perform equally, over targets.
+
+    A tuner that failed on a target has the worst rank there. Errors are compared as rounded
+    logarithms, so that rounding errors do not break ties.
+
+    Args:
+        errors: errors, (targets, tuners); NaN for a failed run.
+
+    Returns:
+        The p-value; NaN with too few targets or fewer than three tuners.
+    """
+    from scipy.stats import friedmanchisquare
+
+    targets, tuners = errors.shape
+    if targets < MIN_PROBLEMS_FOR_RANKS or tuners < 3:
+        return float("nan")
+    worst = np.where(np.isfinite(errors), errors, np.inf)
+    return float(friedmanchisquare(*np.log(np.maximum(worst, MIN_ERROR)).round(9).T).pvalue)
 
 
 @dataclass(frozen=True)
@@ -434,24 +451,3 @@ def _compute_mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> floa
             )
         )
     return float(np.nanmean(taus))
-
-
-def compute_friedman_p_value(errors: Array) -> float:
-    """Compute the p-value of Friedman's test that all tuners perform equally, over targets.
-
-    A tuner that failed on a target has the worst rank there. Errors are compared as rounded
-    logarithms, so that rounding errors do not break ties.
-
-    Args:
-        errors: errors, (targets, tuners); NaN for a failed run.
-
-    Returns:
-        The p-value; NaN with too few targets or fewer than three tuners.
-    """
-    from scipy.stats import friedmanchisquare
-
-    targets, tuners = errors.shape
-    if targets < MIN_PROBLEMS_FOR_RANKS or tuners < 3:
-        return float("nan")
-    worst = np.where(np.isfinite(errors), errors, np.inf)
-    return float(friedmanchisquare(*np.log(np.maximum(worst, 1e-12)).round(9).T).pvalue)

@@ -1,7 +1,4 @@
-"""Read the CSV files of a result folder, runs batch by batch, and check every cell.
-
-Rows of runs are those of runs.parquet and of a journal.
-"""
+"""Read the CSV files of a result folder, and check every cell."""
 
 from __future__ import annotations
 
@@ -17,9 +14,7 @@ from bench.benchmark.storage.cell_validation import (
     parse_csv_column,
     select_declared_columns,
 )
-from bench.benchmark.storage.table_schemas import (
-    Columns,
-)
+from bench.benchmark.storage.table_schemas import Columns
 from sims.core.files import get_first_line
 from sims.core.simulator import InputError
 

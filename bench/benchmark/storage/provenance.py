@@ -19,6 +19,8 @@ from bench import __version__
 from sims.core.files import write_atomically
 
 ENVIRONMENT_FILE = "environment.json"
+_METADATA_FIELD = re.compile("(Name|Version): ")
+"""Lines of a package's metadata with its name and version."""
 
 
 def describe_machine() -> dict[str, Any]:
@@ -50,9 +52,6 @@ def _name_and_version(distribution: Distribution) -> tuple[str, str]:
     return distribution.metadata["Name"], distribution.version
 
 
-_METADATA_FIELD = re.compile("(Name|Version): ")
-
-
 def get_utc_time() -> str:
     """Return the present time in UTC."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
@@ -75,6 +74,26 @@ def format_explain_command(recordings: Iterable[object], settings: Mapping[str, 
         elif value not in (None, False, ""):
             words += [f"--{name}", str(value)]
     return words
+
+
+def format_repeated_explain_command(folder: Path) -> str:
+    """Build the command that reproduces an explanation, as far as its folder states it.
+
+    Args:
+        folder: Folder of an explanation, with the record of its settings and recordings.
+
+    Returns:
+        Command line for a shell.
+    """
+    environment = read_environment(folder)
+    # The descriptions of recordings (.toml) are listed too, but are not arguments of the command.
+    tables = [
+        recording["file"]
+        for recording in environment.get("recordings", [])
+        if not recording["file"].endswith(".toml")
+    ]
+    words = format_explain_command(tables or ["RECORDING.csv"], environment.get("settings", {}))
+    return shlex.join(words)
 
 
 def write_explanation_environment(
@@ -128,23 +147,3 @@ def compute_sha256(path: Path) -> str:
         while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
-
-
-def format_repeated_explain_command(folder: Path) -> str:
-    """Build the command that reproduces an explanation, as far as its folder states it.
-
-    Args:
-        folder: Folder of an explanation, with the record of its settings and recordings.
-
-    Returns:
-        Command line for a shell.
-    """
-    environment = read_environment(folder)
-    # The descriptions of recordings (.toml) are listed too, but are not arguments of the command.
-    tables = [
-        recording["file"]
-        for recording in environment.get("recordings", [])
-        if not recording["file"].endswith(".toml")
-    ]
-    words = format_explain_command(tables or ["RECORDING.csv"], environment.get("settings", {}))
-    return shlex.join(words)

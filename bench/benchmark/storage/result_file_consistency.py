@@ -1,4 +1,8 @@
-"""Check the consistency between the files of a comparison, and with the plan of its runs."""
+"""Check the files of a comparison against each other, the experiment and the plan of its runs.
+
+Every file is checked cell by cell first. runs.parquet is then reduced to one line per run, which is
+compared with status.csv, training.csv, identifiability.csv and the plan.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +29,12 @@ from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES, RunStatus
 from bench.benchmark.storage.table_schemas import (
     ERROR_TABLE_COLUMNS,
     IDENTIFIABILITY_COLUMNS,
-    RUN_COLUMNS,
     RUN_CONSTANT_COLUMNS,
     STATUS_COLUMNS,
     TRAINING_COLUMNS,
     ColumnSpec,
+    declare_run_columns,
     expand_columns,
-    list_channels,
-    list_parameters,
 )
 from bench.core.plugin_registries import tuners
 from sims.core.files import get_first_line
@@ -45,128 +47,18 @@ if TYPE_CHECKING:
 
 
 _SEED_PATTERN = re.compile("[0-9]{1,9}")
-
+"""Pattern of the seed in the id of a run."""
 RowErrorFactory = Callable[[int, str], InputError]
 """Makes the error for a row of a file, counted from 0."""
-
 TableErrorFactory = Callable[[int | None, str], InputError]
 """Makes the error for a row of a file, counted from 0, or for the whole file (None)."""
-
-
-def list_target_names(experiment: Experiment) -> list[str]:
-    """List the names of all targets of an experiment."""
-    return [f"{kind}-{i:03d}" for i in range(experiment.targets) for kind in experiment.ranges]
-
-
-def list_tuner_labels(experiment: Experiment) -> list[str]:
-    """List the labels of an experiment's tuners."""
-    return [entry.label for entry in experiment.tuners]
-
-
-def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: str) -> None:
-    """Check that a plan (the list of all runs) belongs to an experiment and is complete.
-
-    Args:
-        plan: The id of every run.
-        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
-        path: Path of the plan.
-        remedy: Advice for a damaged plan.
-
-    Raises:
-        InputError: A check fails.
-    """
-    import pandas as pd
-
-    def make_line_error(row: int | None, problem: str) -> InputError:
-        line = "" if row is None else f", line {row + 1}"
-        return InputError(f"{path}{line}: {problem}; {remedy}")
-
-    planned_runs = []
-    for row, name in enumerate(plan):
-        # The id is split from its end, since a label may contain slashes.
-        parts = name.rsplit("/", 3)
-        tuner, target, seed, _ = parts if len(parts) == 4 else [""] * 4
-        if not _SEED_PATTERN.fullmatch(seed):
-            raise make_line_error(
-                row, f"expected TUNER/TARGET/SEED/HASH, found {format_value(name)}"
-            )
-        planned_runs.append((name, tuner, target, int(seed)))
-    plan_table = pd.DataFrame(planned_runs, columns=["run", "tuner", "target", "seed"])
-    names = plan_table["run"]
-    raise_for_first_bad_row(
-        names.duplicated(),
-        make_line_error,
-        lambda row: f"expected every run once, found {names[row]} twice",
-    )
-    check_known(plan_table["tuner"], list_tuner_labels(experiment), "tuner", make_line_error)
-    check_known(plan_table["target"], list_target_names(experiment), "target", make_line_error)
-    check_complete(plan_table, experiment, make_line_error)
-
-
-def check_complete(
-    executed_runs: pd.DataFrame, experiment: Experiment, make_error: TableErrorFactory
-) -> None:
-    """Check that each tuner with runs has all of its runs, and no more.
-
-    It has one run for each target and seed. Tuners without any run were skipped, and are checked
-    elsewhere.
-
-    Args:
-        executed_runs: Tuner, target and seed of each run; the index is the row in the file.
-        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
-        make_error: Makes the error for a row, or for the file.
-
-    Raises:
-        InputError: A run is missing, or there is one too many.
-    """
-    targets = list_target_names(experiment)
-    for entry in experiment.tuners:
-        tuner_rows = executed_runs[executed_runs["tuner"] == entry.label]
-        if tuner_rows.empty:
-            continue
-        seeds = range(_count_seeds(entry, experiment, tuner_rows["seed"].max()))
-        executed = set(zip(tuner_rows["target"], tuner_rows["seed"].tolist(), strict=True))
-        missing = next(((t, s) for t in targets for s in seeds if (t, s) not in executed), None)
-        if missing:
-            target, seed = missing
-            problem = f"expected a run of {entry.label} on {target} with seed {seed}, found none"
-            raise make_error(None, problem)
-        if len(tuner_rows) > len(targets) * len(seeds):
-            is_surplus = tuner_rows.duplicated(["target", "seed"]) | (
-                tuner_rows["seed"] >= len(seeds)
-            )
-            row = int(tuner_rows.index[int(is_surplus.to_numpy().argmax())])
-            raise make_error(
-                row,
-                f"run: expected {len(targets)} targets with {len(seeds)} seeds, "
-                f"found one more: {tuner_rows['run'][row]}",
-            )
-
-
-def _count_seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int:
-    """Return the number of seeds of an entry; `largest` is the largest seed in its planned runs.
-
-    A deterministic tuner has one seed, whatever the experiment states. If more than one seed
-    occurs, the tuner is not deterministic, and need not be loaded to find out. The result equals
-    `bench.benchmark.runner.experiment_runner.count_seeds` if the tuner is known.
-    """
-    seed_count = entry.seeds or experiment.seeds
-    if seed_count == 1 or largest > 0:
-        return seed_count
-    # A single seed is correct for a deterministic tuner. The tuner is loaded only now, since it may
-    # import large packages.
-    try:
-        tuner_class = tuners.get(entry.tuner)
-    except InputError:  # A tuner of a plugin that is not loaded or cannot be used here.
-        return 1
-    return seed_count if tuner_class.stochastic or tuner_class.learned else 1
 
 
 class CheckedFiles(NamedTuple):
     """The files of a comparison with stored runs, checked cell by cell.
 
     Attributes:
-        runs: One line per run; see `bench.benchmark.storage.csv_reader.RunsTable.runs`.
+        runs: One line per run; see `RunsTable.read_runs`.
         statuses: Rows of status.csv.
         training: Rows of training.csv.
         spectra: Rows of identifiability.csv; None if there is no such file.
@@ -284,6 +176,279 @@ def _list_identifiability_columns(names: list[str]) -> list[ColumnSpec]:
     return expand_columns(
         IDENTIFIABILITY_COLUMNS, [name for name in names if name not in declared_names], ()
     )
+
+
+class RunsTable(NamedTuple):
+    """A file of runs.
+
+    Attributes:
+        path: Path of the file.
+        remedy: Advice for a damaged file.
+        rows: Rows that were read already, for a file that is not Parquet; otherwise None.
+        first_row: Number of the first of these rows in the file.
+    """
+
+    path: Path
+    remedy: str
+    rows: pa.Table | None = None
+    first_row: int = 0
+
+    def make_error(self, row: int | None, problem: str) -> InputError:
+        """Make the error for a row, counted from 0, or for the whole file.
+
+        Args:
+            row: Row, or None for the file.
+            problem: What is wrong.
+        """
+        row_text = "" if row is None else f", row {self.first_row + row}"
+        return InputError(f"{self.path}{row_text}: {problem}; {self.remedy}")
+
+    def read_runs(self, experiment: Experiment) -> pd.DataFrame:
+        """Check all rows, and return one line per run, in the order of the file.
+
+        Each line has the columns that are constant within the run, ``row``, at which it begins, and
+        ``used``, its last k. Columns are read one by one, since all of many rows would not fit in
+        memory.
+
+        Args:
+            experiment: Experiment of the runs.
+
+        Raises:
+            InputError: The file is damaged; the message is one line.
+        """
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        try:
+            if self.rows is not None:
+                return _read_checked_runs(self.rows.select, self.rows.column_names, experiment)
+            with parquet.ParquetFile(self.path) as file:
+                names = list(file.schema_arrow.names)
+                return _read_checked_runs(
+                    lambda columns: file.read(columns=columns), names, experiment
+                )
+        except CellError as error:
+            raise self.make_error(error.row, error.says) from None
+        # In a damaged file even the names of columns may be invalid text.
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+            raise self._make_read_error(error) from None
+
+    def _make_read_error(self, error: Exception) -> InputError:
+        """Make the one-line error for a file that is missing, or is not a Parquet file."""
+        missing = isinstance(error, FileNotFoundError)
+        reason = (
+            "no such file" if missing else f"expected a Parquet file, found {get_first_line(error)}"
+        )
+        return InputError(f"{self.path}: not a complete comparison: {reason}; {self.remedy}")
+
+
+def _read_checked_runs(
+    read_columns: Callable[[list[str]], pa.Table], names: list[str], experiment: Experiment
+) -> pd.DataFrame:
+    """Check rows of runs and return one line per run; see `RunsTable.read_runs`.
+
+    A run has one row for each number of simulations k, in consecutive rows.
+
+    Args:
+        read_columns: Reads columns by their names.
+        names: Names of the columns.
+        experiment: Experiment of the runs.
+
+    Returns:
+        One line per run: its constant columns, ``row``, at which it begins, and ``used``, its last
+        k.
+
+    Raises:
+        CellError: A cell or a run violates its declaration.
+    """
+    import pandas as pd
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if not names:  # Without runs there are no columns.
+        return pd.DataFrame(columns=["run", *RUN_CONSTANT_COLUMNS, "row", "used"])
+    columns = select_declared_columns(names, declare_run_columns(names, experiment))
+    declared = {column.name: column for column in columns}
+
+    def read(name: str) -> pa.Array:
+        return parse_parquet_column(declared[name], read_columns([name])[name])
+
+    run, k = read("run"), read("k").to_numpy()
+    is_recording = to_numpy_mask(compute.equal(read("range"), "real"))
+    is_run_start = np.ones(len(k), dtype=bool)
+    is_run_start[1:] = _find_changes(run)
+    _check_counts(run, k, is_run_start)
+    rows = np.flatnonzero(is_run_start)
+    constants = {"run": run.take(rows)}
+    for name, column in declared.items():
+        values = read(name)
+        check_cells(column, values, k == 0, is_recording)
+        if name in RUN_CONSTANT_COLUMNS or name.startswith("true_"):
+            _check_constant(name, values, ~is_run_start[1:])
+            constants[name] = values.take(rows)
+    # k counts without gaps, so the number of rows gives the last k.
+    used = np.diff(np.append(rows, len(k))) - 1
+    runs: pd.DataFrame = pa.table(constants).to_pandas().assign(row=rows, used=used)
+    is_repeated = runs["run"].duplicated().to_numpy(dtype=bool)
+    if is_repeated.any():
+        repeated = int(is_repeated.argmax())
+        name = runs["run"][repeated]
+        raise CellError(int(rows[repeated]), "run", "every run once", f"{name} again")
+    return runs
+
+
+def _find_changes(values: pa.Array) -> Mask:
+    """Return an (n - 1,) mask of values that differ from the previous one; NaN equals NaN."""
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if pa.types.is_floating(values.type):
+        numbers = values.to_numpy()
+        is_both_missing = np.isnan(numbers[1:]) & np.isnan(numbers[:-1])
+        is_changed: Mask = (numbers[1:] != numbers[:-1]) & ~is_both_missing
+        return is_changed
+    return to_numpy_mask(compute.not_equal(values[1:], values[:-1]))
+
+
+def _check_counts(run: pa.Array, k: NDArray[np.int64], is_run_start: Mask) -> None:
+    """Check that k, the number of simulations, counts 0, 1, 2, ... in the rows of every run.
+
+    Raises:
+        CellError: k has another value, so that a row is missing or added.
+    """
+    # The value of the row before plus one; the first row, to which `roll` wraps around, is a start.
+    expected = np.where(is_run_start, 0, np.roll(k, 1) + 1)
+    is_wrong = k != expected
+    if is_wrong.any():
+        row = int(is_wrong.argmax())
+        raise CellError(row, "k", f"{expected[row]}, the next of {run[row].as_py()}", str(k[row]))
+
+
+def _check_constant(name: str, values: pa.Array, is_same_run: Mask) -> None:
+    """Check that a column that describes a run, such as tuner and target, is constant within it.
+
+    Args:
+        name: Name of the column.
+        values: (n,) values, in which the rows of a run follow each other.
+        is_same_run: (n - 1,) mask of rows that belong to the run of the row before.
+
+    Raises:
+        CellError: a value differs from the row before.
+    """
+    is_changed = _find_changes(values) & is_same_run
+    if is_changed.any():
+        row = int(is_changed.argmax()) + 1
+        before, found = values[row - 1].as_py(), values[row].as_py()
+        raise CellError(row, name, f"{before} as in the row before", str(found))
+
+
+def list_target_names(experiment: Experiment) -> list[str]:
+    """List the names of all targets of an experiment."""
+    return [f"{kind}-{i:03d}" for i in range(experiment.targets) for kind in experiment.ranges]
+
+
+def list_tuner_labels(experiment: Experiment) -> list[str]:
+    """List the labels of an experiment's tuners."""
+    return [entry.label for entry in experiment.tuners]
+
+
+def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: str) -> None:
+    """Check that a plan (the list of all runs) belongs to an experiment and is complete.
+
+    Args:
+        plan: The id of every run.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
+        path: Path of the plan.
+        remedy: Advice for a damaged plan.
+
+    Raises:
+        InputError: A check fails.
+    """
+    import pandas as pd
+
+    def make_line_error(row: int | None, problem: str) -> InputError:
+        line = "" if row is None else f", line {row + 1}"
+        return InputError(f"{path}{line}: {problem}; {remedy}")
+
+    planned_runs = []
+    for row, name in enumerate(plan):
+        # The id is split from its end, since a label may contain slashes.
+        parts = name.rsplit("/", 3)
+        tuner, target, seed, _ = parts if len(parts) == 4 else [""] * 4
+        if not _SEED_PATTERN.fullmatch(seed):
+            raise make_line_error(
+                row, f"expected TUNER/TARGET/SEED/HASH, found {format_value(name)}"
+            )
+        planned_runs.append((name, tuner, target, int(seed)))
+    plan_table = pd.DataFrame(planned_runs, columns=["run", "tuner", "target", "seed"])
+    names = plan_table["run"]
+    raise_for_first_bad_row(
+        names.duplicated(),
+        make_line_error,
+        lambda row: f"expected every run once, found {names[row]} twice",
+    )
+    check_known(plan_table["tuner"], list_tuner_labels(experiment), "tuner", make_line_error)
+    check_known(plan_table["target"], list_target_names(experiment), "target", make_line_error)
+    check_complete(plan_table, experiment, make_line_error)
+
+
+def check_complete(
+    executed_runs: pd.DataFrame, experiment: Experiment, make_error: TableErrorFactory
+) -> None:
+    """Check that each tuner with runs has all of its runs, and no more.
+
+    It has one run for each target and seed. Tuners without any run were skipped, and are checked
+    elsewhere.
+
+    Args:
+        executed_runs: Tuner, target and seed of each run; the index is the row in the file.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
+        make_error: Makes the error for a row, or for the file.
+
+    Raises:
+        InputError: A run is missing, or there is one too many.
+    """
+    targets = list_target_names(experiment)
+    for entry in experiment.tuners:
+        tuner_rows = executed_runs[executed_runs["tuner"] == entry.label]
+        if tuner_rows.empty:
+            continue
+        seeds = range(_count_seeds(entry, experiment, tuner_rows["seed"].max()))
+        executed = set(zip(tuner_rows["target"], tuner_rows["seed"].tolist(), strict=True))
+        missing = next(((t, s) for t in targets for s in seeds if (t, s) not in executed), None)
+        if missing:
+            target, seed = missing
+            problem = f"expected a run of {entry.label} on {target} with seed {seed}, found none"
+            raise make_error(None, problem)
+        if len(tuner_rows) > len(targets) * len(seeds):
+            is_surplus = tuner_rows.duplicated(["target", "seed"]) | (
+                tuner_rows["seed"] >= len(seeds)
+            )
+            row = int(tuner_rows.index[int(is_surplus.to_numpy().argmax())])
+            raise make_error(
+                row,
+                f"run: expected {len(targets)} targets with {len(seeds)} seeds, "
+                f"found one more: {tuner_rows['run'][row]}",
+            )
+
+
+def _count_seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int:
+    """Return the number of seeds of an entry; `largest` is the largest seed in its planned runs.
+
+    A deterministic tuner has one seed, whatever the experiment states. If more than one seed
+    occurs, the tuner is not deterministic, and need not be loaded to find out. The result equals
+    `bench.benchmark.runner.experiment_runner.count_seeds` if the tuner is known.
+    """
+    seed_count = entry.seeds or experiment.seeds
+    if seed_count == 1 or largest > 0:
+        return seed_count
+    # A single seed is correct for a deterministic tuner. The tuner is loaded only now, since it may
+    # import large packages.
+    try:
+        tuner_class = tuners.get(entry.tuner)
+    except InputError:  # A tuner of a plugin that is not loaded or cannot be used here.
+        return 1
+    return seed_count if tuner_class.stochastic or tuner_class.learned else 1
 
 
 def check_statuses(
@@ -526,207 +691,6 @@ def check_journal_statuses(
     return statuses
 
 
-class RunsTable(NamedTuple):
-    """A file of runs.
-
-    Attributes:
-        path: Path of the file.
-        remedy: Advice for a damaged file.
-        rows: Rows that were read already, for a file that is not Parquet; otherwise None.
-        first_row: Number of the first of these rows in the file.
-    """
-
-    path: Path
-    remedy: str
-    rows: pa.Table | None = None
-    first_row: int = 0
-
-    def make_error(self, row: int | None, problem: str) -> InputError:
-        """Make the error for a row, counted from 0, or for the whole file.
-
-        Args:
-            row: Row, or None for the file.
-            problem: What is wrong.
-        """
-        row_text = "" if row is None else f", row {self.first_row + row}"
-        return InputError(f"{self.path}{row_text}: {problem}; {self.remedy}")
-
-    def read_runs(self, experiment: Experiment) -> pd.DataFrame:
-        """Check all rows, and return one line per run, in the order of the file.
-
-        Each line has the columns that are constant within the run, ``row``, at which it begins, and
-        ``used``, its last k. Columns are read one by one, since all of many rows would not fit in
-        memory.
-
-        Args:
-            experiment: Experiment of the runs.
-
-        Raises:
-            InputError: The file is damaged; the message is one line.
-        """
-        import pyarrow as pa
-        from pyarrow import parquet
-
-        try:
-            if self.rows is not None:
-                return _read_checked_runs(self.rows.select, self.rows.column_names, experiment)
-            with parquet.ParquetFile(self.path) as file:
-                names = list(file.schema_arrow.names)
-                return _read_checked_runs(
-                    lambda columns: file.read(columns=columns), names, experiment
-                )
-        except CellError as error:
-            raise self.make_error(error.row, error.says) from None
-        # In a damaged file even the names of columns may be invalid text.
-        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-            raise self._make_read_error(error) from None
-
-    def _make_read_error(self, error: Exception) -> InputError:
-        """Make the one-line error for a file that is missing, or is not a Parquet file."""
-        missing = isinstance(error, FileNotFoundError)
-        reason = (
-            "no such file" if missing else f"expected a Parquet file, found {get_first_line(error)}"
-        )
-        return InputError(f"{self.path}: not a complete comparison: {reason}; {self.remedy}")
-
-
-def declare_run_columns(names: list[str], experiment: Experiment) -> list[ColumnSpec]:
-    """Return the columns that the runs of an experiment must have, with their types and limits.
-
-    Some columns exist once for each parameter or channel: those that the names of the file's
-    columns contain and those of the experiment. If there are none, these columns keep the
-    placeholder PARAMETER or CHANNEL of `table_schemas` in their names.
-
-    Args:
-        names: Names of the file's columns.
-        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
-    """
-    parameters = dict.fromkeys([*list_parameters(names), *experiment.parameters])
-    channels = experiment.observe or list_channels(names)
-    columns = expand_columns(RUN_COLUMNS, parameters or ["PARAMETER"], channels or ["CHANNEL"])
-    # A single parameter also has its error in its own unit.
-    return [c for c in columns if c.name != "param_abs_error" or len(parameters) == 1]
-
-
-def _read_checked_runs(
-    read_columns: Callable[[list[str]], pa.Table], names: list[str], experiment: Experiment
-) -> pd.DataFrame:
-    """Check rows of runs and return one line per run; see `RunsTable.read_runs`.
-
-    A run has one row for each number of simulations k, in consecutive rows.
-
-    Args:
-        read_columns: Reads columns by their names.
-        names: Names of the columns.
-        experiment: Experiment of the runs.
-
-    Returns:
-        One line per run: its constant columns, ``row``, at which it begins, and ``used``, its last
-        k.
-
-    Raises:
-        CellError: A cell or a run violates its declaration.
-    """
-    import pandas as pd
-    import pyarrow as pa
-    from pyarrow import compute
-
-    if not names:  # Without runs there are no columns.
-        return pd.DataFrame(columns=["run", *RUN_CONSTANT_COLUMNS, "row", "used"])
-    columns = select_declared_columns(names, declare_run_columns(names, experiment))
-    declared = {column.name: column for column in columns}
-
-    def read(name: str) -> pa.Array:
-        return parse_parquet_column(declared[name], read_columns([name])[name])
-
-    run, k = read("run"), read("k").to_numpy()
-    is_recording = to_numpy_mask(compute.equal(read("range"), "real"))
-    is_run_start = np.ones(len(k), dtype=bool)
-    is_run_start[1:] = _find_changes(run)
-    _check_counts(run, k, is_run_start)
-    rows = np.flatnonzero(is_run_start)
-    constants = {"run": run.take(rows)}
-    for name, column in declared.items():
-        values = read(name)
-        check_cells(column, values, k == 0, is_recording)
-        if name in RUN_CONSTANT_COLUMNS or name.startswith("true_"):
-            _check_constant(name, values, ~is_run_start[1:])
-            constants[name] = values.take(rows)
-    # k counts without gaps, so the number of rows gives the last k.
-    used = np.diff(np.append(rows, len(k))) - 1
-    runs: pd.DataFrame = pa.table(constants).to_pandas().assign(row=rows, used=used)
-    is_repeated = runs["run"].duplicated().to_numpy(dtype=bool)
-    if is_repeated.any():
-        repeated = int(is_repeated.argmax())
-        name = runs["run"][repeated]
-        raise CellError(int(rows[repeated]), "run", "every run once", f"{name} again")
-    return runs
-
-
-def _find_changes(values: pa.Array) -> Mask:
-    """Return an (n - 1,) mask of values that differ from the previous one; NaN equals NaN."""
-    import pyarrow as pa
-    from pyarrow import compute
-
-    if pa.types.is_floating(values.type):
-        numbers = values.to_numpy()
-        is_both_missing = np.isnan(numbers[1:]) & np.isnan(numbers[:-1])
-        is_changed: Mask = (numbers[1:] != numbers[:-1]) & ~is_both_missing
-        return is_changed
-    return to_numpy_mask(compute.not_equal(values[1:], values[:-1]))
-
-
-def _check_counts(run: pa.Array, k: NDArray[np.int64], is_run_start: Mask) -> None:
-    """Check that k, the number of simulations, counts 0, 1, 2, ... in the rows of every run.
-
-    Raises:
-        CellError: k has another value, so that a row is missing or added.
-    """
-    # The value of the row before plus one; the first row, to which `roll` wraps around, is a start.
-    expected = np.where(is_run_start, 0, np.roll(k, 1) + 1)
-    is_wrong = k != expected
-    if is_wrong.any():
-        row = int(is_wrong.argmax())
-        raise CellError(row, "k", f"{expected[row]}, the next of {run[row].as_py()}", str(k[row]))
-
-
-def _check_constant(name: str, values: pa.Array, is_same_run: Mask) -> None:
-    """Check that a column that describes a run, such as tuner and target, is constant within it.
-
-    Args:
-        name: Name of the column.
-        values: (n,) values, in which the rows of a run follow each other.
-        is_same_run: (n - 1,) mask of rows that belong to the run of the row before.
-
-    Raises:
-        CellError: a value differs from the row before.
-    """
-    is_changed = _find_changes(values) & is_same_run
-    if is_changed.any():
-        row = int(is_changed.argmax()) + 1
-        before, found = values[row - 1].as_py(), values[row].as_py()
-        raise CellError(row, name, f"{before} as in the row before", str(found))
-
-
-def raise_for_first_bad_row(
-    bad: pd.Series | Mask, make_error: RowErrorFactory, describe_row: Callable[[int], str]
-) -> None:
-    """Raise an error for the first bad row.
-
-    Args:
-        bad: Mask of bad rows.
-        make_error: Makes the error.
-        describe_row: Describes what is wrong in a row.
-
-    Raises:
-        InputError: There is a bad row.
-    """
-    mask = np.asarray(bad, dtype=bool)
-    if mask.any():
-        row = int(mask.argmax())
-        raise make_error(row, describe_row(row))
-
-
 def check_known(
     values: pd.Series, known_values: Iterable[str], column: str, make_error: RowErrorFactory
 ) -> None:
@@ -771,3 +735,22 @@ def check_equal(
         make_error,
         lambda i: f"{name}: expected {expected[i]} {why}, found {found[i]}",
     )
+
+
+def raise_for_first_bad_row(
+    bad: pd.Series | Mask, make_error: RowErrorFactory, describe_row: Callable[[int], str]
+) -> None:
+    """Raise an error for the first bad row.
+
+    Args:
+        bad: Mask of bad rows.
+        make_error: Makes the error.
+        describe_row: Describes what is wrong in a row.
+
+    Raises:
+        InputError: There is a bad row.
+    """
+    mask = np.asarray(bad, dtype=bool)
+    if mask.any():
+        row = int(mask.argmax())
+        raise make_error(row, describe_row(row))

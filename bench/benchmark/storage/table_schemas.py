@@ -1,8 +1,8 @@
 """Declaration of every column and key in the files of a result folder.
 
-`storage.cell_validation` checks the cells of a column, `storage.csv_reader` the rows of a run, and
-`storage.result_file_consistency` the consistency between files. A column that is added later is
-`required=False` and has a `default`, so that older folders can still be read.
+`storage.cell_validation` checks the cells of a column, and `storage.result_file_consistency` the
+rows of a run and the consistency between files. A column that is added later is `required=False`
+and has a `default`, so that older folders can still be read.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
-from bench.benchmark.problem.experiment_config import RANGES
+from bench.benchmark.problem.experiment_config import RANGES, Experiment
 from bench.benchmark.storage.run_status import STATUSES
 
 SHOT_STATUSES = (*STATUSES, "no plan", "no recording")
@@ -360,6 +360,24 @@ def expand_columns(
                 for n in names[placeholder]
             ]
     return expanded_columns
+
+
+def declare_run_columns(names: list[str], experiment: Experiment) -> list[ColumnSpec]:
+    """Return the columns that the runs of an experiment must have, with their types and limits.
+
+    Some columns exist once for each parameter or channel: those that the names of the file's
+    columns contain and those of the experiment. If there are none, these columns keep the
+    placeholder PARAMETER or CHANNEL in their names.
+
+    Args:
+        names: Names of the file's columns.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
+    """
+    parameters = dict.fromkeys([*list_parameters(names), *experiment.parameters])
+    channels = experiment.observe or list_channels(names)
+    columns = expand_columns(RUN_COLUMNS, parameters or ["PARAMETER"], channels or ["CHANNEL"])
+    # A single parameter also has its error in its own unit.
+    return [c for c in columns if c.name != "param_abs_error" or len(parameters) == 1]
 
 
 def list_parameters(names: Iterable[str]) -> list[str]:

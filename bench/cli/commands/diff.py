@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, PrintLine
 from bench.cli.shared_options import parse_path
-from bench.studies.result_diff import compare_folders
-
-if TYPE_CHECKING:
-    pass
 
 
 def add_diff_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +42,7 @@ def _run_diff(options: argparse.Namespace, print_line: PrintLine) -> CommandResu
     Returns:
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND for a failure.
     """
+    from bench.studies.result_diff import compare_folders
     from sims.core.files import check_absent, write_files
 
     if options.out is not None:

@@ -7,10 +7,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.benchmark.problem.missing_requirements import list_dependent_experiments
 from bench.cli.output import CommandResult, JsonDocument, PrintLine
 from bench.cli.shared_options import parse_path
-from bench.datasets.public_datasets import find_present_folder
 
 if TYPE_CHECKING:
     from bench.datasets.public_datasets import DataSet
@@ -57,6 +55,7 @@ def _run_download(options: argparse.Namespace, print_line: PrintLine) -> Command
     Returns:
         The JSON document of the command, and its exit code (0).
     """
+    from bench.benchmark.problem.missing_requirements import list_dependent_experiments
     from bench.datasets import public_datasets
 
     names_to_download = (
@@ -73,7 +72,7 @@ def _run_download(options: argparse.Namespace, print_line: PrintLine) -> Command
         )
     downloaded = []
     for data_set in data_sets:
-        present_folder = find_present_folder(data_set, options.out)
+        present_folder = public_datasets.find_present_folder(data_set, options.out)
         if present_folder:
             print_line(f"{data_set.name}: already in {present_folder}")
             continue
@@ -140,6 +139,8 @@ def _explain_folder_lookup(data_set: DataSet, target_folder: Path) -> str:
 
 def _format_data_set(data_set: DataSet) -> list[str]:
     """Format a data set for the list: size, licence, place, title, experiments and source."""
+    from bench.benchmark.problem.missing_requirements import list_dependent_experiments
+
     folder = data_set.folder()
     state = f"in {folder}" if folder else f"not here: run `{data_set.command}`"
     experiment_names = ", ".join(list_dependent_experiments(data_set))
@@ -156,6 +157,9 @@ def _make_data_set_document(data_set: DataSet, target_folder: Path | None = None
 
     `target_folder` is the folder that the user named for downloads; None for the default folder.
     """
+    from bench.benchmark.problem.missing_requirements import list_dependent_experiments
+    from bench.datasets.public_datasets import find_present_folder
+
     return {
         "name": data_set.name,
         "title": data_set.title,

@@ -16,7 +16,6 @@ from bench.cli.shared_options import (
     parse_name_list,
     parse_path,
 )
-from bench.logs.quality import log_quality
 
 if TYPE_CHECKING:
     from bench.diagnosis.conventions.convention_comparison import ConventionDifference
@@ -146,7 +145,7 @@ def _list_warnings(recording: Recording, kind: type[Simulator]) -> list[str]:
         kind: simulator class.
     """
     from bench.logs.quality.clock_checks import find_anomalies
-    from bench.logs.quality.log_quality import find_log_anomalies
+    from bench.logs.quality.log_quality import find_log_anomalies, format_log_warnings
     from bench.logs.quality.pose_checks import find_missing_base_poses
 
     oddities = [
@@ -156,7 +155,7 @@ def _list_warnings(recording: Recording, kind: type[Simulator]) -> list[str]:
     ]
     return [
         *(oddity.text for oddity in oddities),
-        *log_quality.format_log_warnings(recording, kind),
+        *format_log_warnings(recording, kind),
     ]
 
 

@@ -40,7 +40,7 @@ def _run_score(options: argparse.Namespace, print_line: PrintLine) -> CommandRes
         options: parsed arguments of the command.
         print_line: prints one line of text.
     """
-    from bench.api.explain import score
+    from bench.api.score import score
     from bench.core.plugin_registries import load_plugins
 
     load_plugins(options.plugin)

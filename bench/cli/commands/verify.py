@@ -35,7 +35,7 @@ def _run_verify(options: argparse.Namespace, print_line: PrintLine) -> CommandRe
         The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a number does
         not follow from the others.
     """
-    from bench.studies.archive_bundle import verify_results
+    from bench.studies.result_verification import verify_results
 
     verification = verify_results(options.run, print_line, options.plugin, options.all)
     return CommandResult(

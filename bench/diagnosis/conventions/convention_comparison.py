@@ -45,12 +45,10 @@ from bench.diagnosis.kalman.candidate_responses import compute_columns
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.kalman.linearised_filter import MAX_LINEARISATIONS, FollowedRuns
 from bench.diagnosis.kalman.measured_joint_forces import compute_joint_forces, has_joint_forces
+from bench.diagnosis.prediction_error.dry_friction_fits import make_soft_friction_models
 from bench.diagnosis.prediction_error.effect_proposals import compute_offset_from_command
 from bench.diagnosis.prediction_error.effects_at_joints import MANY_SHAPES
-from bench.diagnosis.prediction_error.filters_with_effects import (
-    GAUSS_NEWTON_STEPS,
-    make_soft_friction_models,
-)
+from bench.diagnosis.prediction_error.filters_with_effects import GAUSS_NEWTON_STEPS
 from bench.diagnosis.prediction_error.regression_columns import group_coefficients
 from bench.diagnosis.prediction_error.regression_selection import Selected, identify
 from bench.diagnosis.search.candidate_directions import iterate_first_probes

@@ -2,10 +2,6 @@
 
 Each hypothesis transforms the recorded signals to the conventions of the model. It changes a sign,
 a zero position, a unit or the order of joints, restores whole turns, or shifts commands in time.
-
-Some loggers write the measured position into the column of the command. A servo with such a command
-exerts no force, so the log contains no input, and any cause would only imitate it. Equality in
-every digit over a whole motion cannot be an accident: encoders have noise.
 """
 
 from __future__ import annotations
@@ -20,7 +16,7 @@ import numpy as np
 
 from bench.diagnosis.conventions.signal_changes import SignalChange, advance_inputs, change_signals
 from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, DescribedSignal, Subject
-from bench.logs.importing.joint_order import find_best_order
+from bench.logs.importing.joint_order import find_order_by_variance
 from bench.logs.importing.normalised_positions import compute_range_scale
 from sims.core.simulator import Array
 from sims.core.user_messages import join_first_names
@@ -371,7 +367,15 @@ def _generate_joint_orders(
         {i: len(joints) - 1 - i for i in indices},  # The log has the reversed order.
     ]
     if has_commands and "q" in quantities:
-        orders.append(_find_order_of_commands(joints, recording))
+        # Every joint has a recorded position and a command here.
+        signals_of_runs = (
+            (
+                [run.inputs[joint.inputs[0]] for joint in joints],
+                [run.channels[joint.channels["q"]] for joint in joints],
+            )
+            for run in recording.training()
+        )
+        orders.append(find_order_by_variance(signals_of_runs, len(joints)))
     for order in orders:
         exchanged = [
             (joints[index], joints[source]) for index, source in order.items() if index != source
@@ -397,28 +401,6 @@ def _generate_joint_orders(
         if channels:
             text = f"the channels and commands of {names} look exchanged"
             yield ConventionHypothesis(text, {**channels, **commands})
-
-
-def _find_order_of_commands(joints: Sequence[JointSignals], recording: Recording) -> dict[int, int]:
-    """Return the order of positions that follows the commands best, by linear assignment.
-
-    A position differs little from its own command, so the variance of the difference is the cost.
-
-    Args:
-        joints: joints with a recorded position and a command each.
-        recording: the recording; its training runs are compared.
-
-    Returns:
-        For the index of each command, the index of the joint whose position follows it.
-    """
-    count = len(joints)
-    costs = np.zeros((count, count))
-    for run in recording.training():
-        commands = [run.inputs[joint.inputs[0]] for joint in joints]
-        positions = [run.channels[joint.channels["q"]] for joint in joints]
-        for i, j in np.ndindex(count, count):
-            costs[i, j] += float(np.nanvar(positions[j] - commands[i]))
-    return dict(enumerate(find_best_order(costs)))
 
 
 def _generate_units(

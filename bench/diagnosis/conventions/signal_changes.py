@@ -1,4 +1,4 @@
-"""Changes of recorded signals: another source, a factor, an offset, or whole turns."""
+"""Changes of recorded signals: source, factor, offset, whole turns, and the times of inputs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sims.core.angles_and_quaternions import unwrapped
+from sims.core.angles_and_quaternions import unwrap_angle
 from sims.core.simulator import Array
 from sims.recording.recording import Recording, Run
 
@@ -38,7 +38,7 @@ class SignalChange:
         """
         values = signals[self.source]
         if self.unwrap:
-            values = unwrapped(values, signals.get(self.command))
+            values = unwrap_angle(values, signals.get(self.command))
         return self.scale * values + self.offset
 
 

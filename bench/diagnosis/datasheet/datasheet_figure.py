@@ -1,4 +1,4 @@
-"""Drive and back-drive diagram as a figure, and the data sheet as one printed page."""
+"""Data sheet as one printed page, and its drive and back-drive diagram as a figure."""
 
 from __future__ import annotations
 

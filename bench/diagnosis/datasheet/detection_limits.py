@@ -1,9 +1,9 @@
 """Detection limits: how large each absent effect would have to be for the data to reveal it.
 
-The limits are computed at a fitted model. A are the whitened derivatives by the parameters of the
-model, and d the derivatives by one more coefficient; the initial states of each run are projected
-out of both (`validation.confidence_intervals`). The remaining information on the coefficient, after
-A is projected out too, is
+The limits of absent effects (`compute_detection_limits`) are computed at a fitted model. A are the
+whitened derivatives by the parameters of the model, and d the derivatives by one more coefficient;
+the initial states of each run are projected out of both (`validation.confidence_intervals`). The
+remaining information on the coefficient, after A is projected out too, is
 
     power = d'd - d'A (A'A)^-1 A'd                                                              (1)
 
@@ -68,8 +68,6 @@ SAME_COEFFICIENT_CORRELATION = 0.999
 """Minimum correlation for which the coefficient of an effect counts as equivalent to that of a
 simpler effect.
 """
-
-
 GAP_HALVINGS = 5
 """Number of times that the smallest backlash of the search is halved."""
 MIN_CONFOUNDING_SHARE = 0.1
@@ -141,6 +139,52 @@ class DetectionLimits:
     covariance: Array
     limits: Mapping[tuple[str, str], DetectionLimit]
     prediction_half_widths: Mapping[str, float]
+
+
+def make_limit_from_interval(
+    number: FittedValue, file_value: ModelFileValue | None
+) -> DetectionLimit:
+    """Return the detection limit of a fitted number: the larger end of its 95 % interval.
+
+    Args:
+        number: Fitted number with its interval.
+        file_value: Its value in the model file, by which the limit is scaled; None if the file has
+            none.
+    """
+    low, high = number.low or 0.0, number.high or 0.0
+    size = max(abs(low), abs(high))
+    return DetectionLimit(size if file_value is None else file_value.compute_half_width(size))
+
+
+def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> Iterator[str]:
+    """Yield the names of effects that can act at the subject but are not in the model.
+
+    Simpler forms of the effects in the model are left out: a model with Stribeck friction does not
+    lack Coulomb friction. So are effects at all places of a kind at once (families). An effect
+    whose coefficients are all zero counts as absent.
+
+    Args:
+        subject: Joint or system of the sheet.
+        extended: Extended simulator.
+    """
+    local_effects = [
+        effect
+        for name, coefficients in extended.effects.items()
+        for effect, _, fitted_value in subject.localise_effect(name, coefficients)
+        if fitted_value.value != 0
+    ]
+    modelled = {*local_effects, *extended.effects}
+    effect_classes = {effect.name: effect for effect in subject.list_effects()}
+    # An effect names in `contains` the simpler ones to which it reduces if some of its coefficients
+    # are zero.
+    simpler_effects = {
+        contained_effect
+        for name in local_effects
+        for contained_effect in getattr(effect_classes.get(name), "contains", ())
+    }
+    for name in effect_classes:
+        if name not in modelled | simpler_effects and name.partition("@")[2] != ALL_PLACES:
+            yield name
 
 
 def compute_detection_limits(
@@ -498,49 +542,3 @@ class _DetectionLimitCalculator:
         if information[smallest] > information[largest]:
             return DetectionLimit(max(detectable_sizes, default=np.inf), limit="below")
         return DetectionLimit(min(detectable_sizes, default=np.inf), limit="above")
-
-
-def make_limit_from_interval(
-    number: FittedValue, file_value: ModelFileValue | None
-) -> DetectionLimit:
-    """Return the detection limit of a fitted number: the larger end of its 95 % interval.
-
-    Args:
-        number: the number, with its interval.
-        file_value: its value in the model file, by which the limit is scaled; None if the file has
-            none.
-    """
-    low, high = number.low or 0.0, number.high or 0.0
-    size = max(abs(low), abs(high))
-    return DetectionLimit(size if file_value is None else file_value.compute_half_width(size))
-
-
-def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> Iterator[str]:
-    """Yield the names of effects that can act at the subject but are not in the model.
-
-    Simpler forms of the effects in the model are left out: a model with Stribeck friction does not
-    lack Coulomb friction. So are effects at all places of a kind at once (families). An effect
-    whose coefficients are all zero counts as absent.
-
-    Args:
-        subject: Joint or system of the sheet.
-        extended: Extended simulator.
-    """
-    local_effects = [
-        effect
-        for name, coefficients in extended.effects.items()
-        for effect, _, fitted_value in subject.localise_effect(name, coefficients)
-        if fitted_value.value != 0
-    ]
-    modelled = {*local_effects, *extended.effects}
-    effect_classes = {effect.name: effect for effect in subject.list_effects()}
-    # An effect names in `contains` the simpler ones to which it reduces if some of its coefficients
-    # are zero.
-    simpler_effects = {
-        contained_effect
-        for name in local_effects
-        for contained_effect in getattr(effect_classes.get(name), "contains", ())
-    }
-    for name in effect_classes:
-        if name not in modelled | simpler_effects and name.partition("@")[2] != ALL_PLACES:
-            yield name

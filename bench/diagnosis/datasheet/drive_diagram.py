@@ -9,6 +9,7 @@ all other forces at rest:
     U - P + f < -F(U, P)    moves back: where P > 0 the load drives the motor                   (2)
 
 In between, the joint holds. The laws are those of the registered effects, evaluated at rest.
+`compute_drive_diagram` finds the boundaries, and `draw_diagram` draws them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Recorded runs prepared for fitting: inputs, observations and guesses of initial states."""
+"""Guesses of the initial states of recorded runs, and the runs prepared with them for fitting.
+
+A guess is the value and slope of the first samples, the mean of the readings of a joint at rest, or
+a start height from which a ball does not land.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +22,10 @@ MIN_SAMPLES_FOR_PARABOLA = 5
 """Minimum number of samples to fit a parabola; with fewer samples a line is fitted."""
 MIN_SAMPLES_FOR_SLOPE = 3
 """Minimum number of samples to estimate a slope; with fewer samples it would be mostly noise."""
+MIN_RESTING_READINGS = 10
+"""Minimum number of readings whose mean is the position of a joint that rests."""
+MAX_RESTING_DEVIATION = 3.0
+"""Maximum excess of the scatter of readings at rest, in its standard deviations."""
 DEFAULT_START_HEIGHT = 10.0
 """Start height in metres of a ball without a recorded height.
 
@@ -27,12 +35,6 @@ MAX_UNKNOWN_FALL_SPEED = 100.0
 """Maximum assumed fall speed in m/s of a ball whose height and speed are not recorded."""
 DEFAULT_GRAVITY = 9.81
 """Gravity of a system that does not declare it, m/s²."""
-
-MIN_RESTING_READINGS = 10
-"""Minimum number of readings whose mean is the position of a joint that rests."""
-
-MAX_RESTING_DEVIATION = 3.0
-"""Maximum excess of the scatter of readings at rest, in its standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,39 @@ def prepare_run(
     )
 
 
+def take_first_samples(scenario: Scenario, samples: int) -> Scenario:
+    """Return a scenario with all its signals cut to the first samples.
+
+    Args:
+        scenario: the scenario.
+        samples: number of samples to keep.
+    """
+    if samples >= scenario.times.size:
+        return scenario
+    inputs = {name: signal[:samples] for name, signal in scenario.inputs.items()}
+    off_masks = {name: mask[:samples] for name, mask in scenario.off.items()}
+    return replace(scenario, times=scenario.times[:samples], inputs=inputs, off=off_masks)
+
+
+def _find_unobserved_states(simulator: SystemSimulator) -> set[str]:
+    """Return the states (coordinate and rate) of coordinates that no recorded channel shows.
+
+    They keep their defaults, because the data cannot determine them.
+
+    Args:
+        simulator: simulator with the recorded channels.
+    """
+    system, recorded_channels = simulator.system, {c.name for c in simulator.channels}
+    unobserved_states = set()
+    pairs = zip(system.coordinates, system.rates, strict=False)
+    for axis, (coordinate, rate) in enumerate(pairs):
+        related_channels = {coordinate, rate, f"accel_{coordinate}"}
+        # Biases and springs act on the primary coordinate, so its states are always estimated.
+        if axis != system.primary and not related_channels & recorded_channels:
+            unobserved_states |= {coordinate, rate}
+    return unobserved_states
+
+
 def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, float]:
     """Return a guess of each initial state by name, from which fits start.
 
@@ -137,55 +172,6 @@ def _guess_initial_states(run: Run, simulator: SystemSimulator) -> dict[str, flo
     return system.close_loops(values, {*run.channels, *run.initial})
 
 
-def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:
-    """Return a start height in metres from which the ball does not land during the run.
-
-    It is used if the height is not recorded, because impacts can then not be identified.
-
-    Args:
-        run: the run; its constant ``gravity`` (m/s²) replaces that of the simulator.
-        simulator: simulator of the ball.
-    """
-    constant = simulator.constant_values.get("gravity", DEFAULT_GRAVITY)
-    gravity = float(run.constants.get("gravity", constant))
-    seconds = float(run.times[-1] - run.times[0])
-    # Allow for twice the fall due to gravity and for a fast downward throw.
-    return DEFAULT_START_HEIGHT + MAX_UNKNOWN_FALL_SPEED * seconds + gravity * seconds**2
-
-
-def _find_unobserved_states(simulator: SystemSimulator) -> set[str]:
-    """Return the states (coordinate and rate) of coordinates that no recorded channel shows.
-
-    They keep their defaults, because the data cannot determine them.
-
-    Args:
-        simulator: simulator with the recorded channels.
-    """
-    system, recorded_channels = simulator.system, {c.name for c in simulator.channels}
-    unobserved_states = set()
-    pairs = zip(system.coordinates, system.rates, strict=False)
-    for axis, (coordinate, rate) in enumerate(pairs):
-        related_channels = {coordinate, rate, f"accel_{coordinate}"}
-        # Biases and springs act on the primary coordinate, so its states are always estimated.
-        if axis != system.primary and not related_channels & recorded_channels:
-            unobserved_states |= {coordinate, rate}
-    return unobserved_states
-
-
-def take_first_samples(scenario: Scenario, samples: int) -> Scenario:
-    """Return a scenario with all its signals cut to the first samples.
-
-    Args:
-        scenario: the scenario.
-        samples: number of samples to keep.
-    """
-    if samples >= scenario.times.size:
-        return scenario
-    inputs = {name: signal[:samples] for name, signal in scenario.inputs.items()}
-    off_masks = {name: mask[:samples] for name, mask in scenario.off.items()}
-    return replace(scenario, times=scenario.times[:samples], inputs=inputs, off=off_masks)
-
-
 def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float, float]:
     """Estimate value and slope at the first time from a parabola through the first samples.
 
@@ -212,6 +198,22 @@ def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float
     # Coefficients of ascending powers.
     value, slope, *_ = np.polynomial.polynomial.polyfit(t / scale, y, degree)
     return float(value), float(slope / scale)
+
+
+def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:
+    """Return a start height in metres from which the ball does not land during the run.
+
+    It is used if the height is not recorded, because impacts can then not be identified.
+
+    Args:
+        run: the run; its constant ``gravity`` (m/s²) replaces that of the simulator.
+        simulator: simulator of the ball.
+    """
+    constant = simulator.constant_values.get("gravity", DEFAULT_GRAVITY)
+    gravity = float(run.constants.get("gravity", constant))
+    seconds = float(run.times[-1] - run.times[0])
+    # Allow for twice the fall due to gravity and for a fast downward throw.
+    return DEFAULT_START_HEIGHT + MAX_UNKNOWN_FALL_SPEED * seconds + gravity * seconds**2
 
 
 def estimate_resting_position(readings: Array, sigma: float) -> float | None:

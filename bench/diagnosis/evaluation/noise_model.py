@@ -1,4 +1,4 @@
-"""AR(1) sensor noise: likelihood, whitening and portmanteau test.
+"""AR(1) sensor noise: likelihood, whitening, portmanteau test and standard error of sigma.
 
 The noise e of a channel has variance σ² and correlation φ between neighbouring samples (G. E. P.
 Box, G. M. Jenkins, Time Series Analysis, chapter 3). The innovations u are independent:
@@ -43,6 +43,8 @@ MAX_PHI = 0.995
 """Maximum correlation that is tried; at 1 the noise is not stationary, and (2) divides by zero."""
 MIN_EFFECTIVE_SAMPLE_SHARE = 0.1
 """Minimum share of the samples that remain as degrees of freedom after a fit."""
+MAX_STANDARD_ERROR_PHI = 0.99
+"""Maximum correlation from which the standard error of a standard deviation is computed."""
 PORTMANTEAU_LAGS = 20
 """Number of autocorrelations in the portmanteau test."""
 
@@ -262,6 +264,26 @@ def _list_nearby_phis(residual: Array, observed_mask: Mask) -> Array:
     return correlations
 
 
+def compute_sigma_standard_error(phi: float, sample_count: int) -> float:
+    """Return the relative standard error of an estimated standard deviation of AR(1) noise.
+
+    The standard deviation sigma is that of a residual of n samples with correlation phi (formula of
+    M. S. Bartlett, 1946, at lag 0):
+
+        sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n))                              (5)
+
+    Args:
+        phi: correlation of neighbouring samples; its magnitude counts at most as
+            `MAX_STANDARD_ERROR_PHI`.
+        sample_count: number n of samples; it counts at least as 2.
+    """
+    # At a correlation of one, the formula diverges, and no channel would exceed its noise.
+    phi = min(abs(phi), MAX_STANDARD_ERROR_PHI)
+    # A channel may have no samples, and must not be divided by zero.
+    relative_variance = (1.0 + phi * phi) / (1.0 - phi * phi) / (2.0 * max(sample_count, 2))
+    return float(np.sqrt(relative_variance))  # (5)
+
+
 def compute_portmanteau_p_value(
     residual: Array, observed_mask: Mask, likelihood: Likelihood
 ) -> float:
@@ -272,7 +294,7 @@ def compute_portmanteau_p_value(
     1 degrees of freedom; φ has used one (G. M. Ljung, G. E. P. Box, Biometrika 65(2), 297, 1978,
     doi:10.1093/biomet/65.2.297).
 
-        Q = n (n + 2) Σ r_k² / (n - k)                                                           (5)
+        Q = n (n + 2) Σ r_k² / (n - k)                                                           (6)
 
     With several channels, the smallest p-value is multiplied by their number (Bonferroni).
 
@@ -293,7 +315,7 @@ def compute_portmanteau_p_value(
             sample_count
             * (sample_count + 2.0)
             * _compute_ljung_box_sum(white[:, :, 0], sample_count)
-        )  # (5)
+        )  # (6)
         min_p_value = min(min_p_value, chi_squared_tail(PORTMANTEAU_LAGS - 1, statistic))
     return min(1.0, min_p_value * len(likelihood.phi))
 

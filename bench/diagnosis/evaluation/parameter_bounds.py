@@ -5,7 +5,7 @@ Times and frequencies follow the time scale of the recording (`evaluation.time_s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -335,6 +335,33 @@ def widen_range(parameter: Parameter, limits: Bounds) -> Bounds:
     lower_limit, upper_limit = limits
     # A present end that is already beyond its limit stays where it is.
     return max(lower, min(lower_limit, low)), min(upper, max(upper_limit, high))
+
+
+def list_wider_bounds(
+    evaluator: RunEvaluator, theta: Array, fixed_parameters: Collection[int]
+) -> dict[str, Bounds]:
+    """Return wider ranges of fitted base parameters that are at a bound of their range, by name.
+
+    Parameters for which physics does not allow values beyond this bound are not included.
+
+    Shapes: P parameters.
+
+    Args:
+        evaluator: the runs, with the present range of each parameter.
+        theta: (P,) parameters of a fit of the base model within these ranges.
+        fixed_parameters: indices of parameters that were not fitted.
+    """
+    wider_bounds = {}
+    for index in evaluator.base_indices.tolist():
+        parameter = evaluator.parameters[index]
+        low, high = parameter.bounds
+        # The end of the range at which the fitted value lies, "low" or "high"; None inside.
+        bound = bound_of(float(theta[index]), low, high)
+        lower, upper = widen_range(parameter, get_physical_limits(evaluator, index))
+        is_widened = (bound == "low" and lower < low) or (bound == "high" and upper > high)
+        if is_widened and index not in fixed_parameters:
+            wider_bounds[parameter.name] = lower, upper
+    return wider_bounds
 
 
 def describe_unusual_values(

@@ -7,9 +7,12 @@ then varied, one property at a time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
+
+import numpy as np
 
 from bench.diagnosis.experiment_design.candidate_runs import RigModel
 from bench.diagnosis.experiment_design.information_gain import (
@@ -28,6 +31,10 @@ PLANS_VARIED_PER_ROUND = 2
 """Number of plans that are varied in each round."""
 PLANS_TESTED_FOR_LENGTH = 8
 """Maximum number of plans that are also tested with a longer run."""
+MAX_REPEATS = 8
+"""Maximum number of repetitions of a run that is recommended."""
+MAX_LOG_GAIN = 50.0
+"""Largest logarithm of a gain that is printed as a factor."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +99,66 @@ class NextRunDesign:
             "constants": dict(self.constants),
             "groups": self.groups,
         }
+
+    def format_csv(self) -> str:
+        """Format the commands as CSV text: a column ``t``, and one for each input."""
+        columns = [self.times, *self.inputs.values()]
+        rows = ["t," + ",".join(self.inputs) if self.inputs else "t"]
+        rows += [",".join(f"{value:.9g}" for value in row) for row in np.column_stack(columns)]
+        return "\n".join(rows) + "\n"
+
+    def format_lines(self) -> list[str]:
+        """Format the run and its expected benefit as text lines."""
+        initial_text = ", ".join(f"{name} = {value:.4g}" for name, value in self.initial.items())
+        lines = [f"record next, {self.times[-1]:.3g} s: {self.says}; begin near {initial_text}"]
+        if self.is_for_discrimination:
+            return [*lines, *_format_discrimination(self)]
+        # The gain is a logarithm; its limit keeps the factor printable.
+        factor = math.exp(min(self.gain, MAX_LOG_GAIN))
+        benefit = (
+            f"it shrinks the joint confidence region of all parameters by a factor of {factor:.3g}"
+        )
+        return [*lines, f"no causes need to be distinguished: {benefit}"]
+
+
+def _format_discrimination(design: NextRunDesign) -> list[str]:
+    """Format which causes a run distinguishes from the present one, and which it does not.
+
+    The discrimination of two causes is the squared distance between their predictions, in noise
+    standard deviations. It is proportional to the number of recordings, which gives the number of
+    repeats that would be needed.
+
+    Args:
+        design: the designed run with its discrimination.
+    """
+    lines, discrimination = [], design.discrimination
+    if design.distinguished_effects:
+        distances = [
+            f"{name} ({math.sqrt(discrimination[name]):.3g})"
+            for name in design.distinguished_effects
+        ]
+        lines.append(
+            f"it distinguishes {design.effect} from {', '.join(distances)}; in brackets: "
+            "distance between the predictions in noise standard deviations, with all parameters "
+            "refitted"
+        )
+    remaining = [name for name in discrimination if name not in design.distinguished_effects]
+    if remaining:
+        lines.append(f"no run of this kind distinguishes it from {', '.join(remaining)}")
+    # The cause that needs the fewest repetitions.
+    best = max((discrimination[name] for name in remaining), default=0.0)
+    if best > 0 and (repeats := math.ceil(DISCRIMINATION_THRESHOLD / best)) <= MAX_REPEATS:
+        lines.append(f"{repeats} recordings of it would distinguish one more of these")
+    if design.settles_all:
+        lines.append("all equivalent causes are then distinguished")
+    other_groups = [
+        group for group in design.groups if len(group) > 1 and design.effect not in group
+    ]
+    lines += [
+        f"if the cause is one of {', '.join(group)}, this run does not distinguish them"
+        for group in other_groups
+    ]
+    return lines
 
 
 def design_next_run(

@@ -22,14 +22,12 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.parameter_bounds import (
     MAX_WIDENING_ROUNDS,
-    Bounds,
-    bound_of,
-    get_physical_limits,
+    list_wider_bounds,
     use_bounds,
-    widen_range,
 )
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from sims.core.simulator import Array, Parameter
 
@@ -49,6 +47,10 @@ LOG_SCALE_RATIO = 5.0
 """Minimum ratio of the bounds of a parameter for which starts are spaced logarithmically."""
 FAILED_SAMPLE_RESIDUAL = 1e3
 """Residual of a sample that a start could not simulate, in the unit of the channel."""
+TUNER_SIMULATION_BUDGET = 60
+"""Maximum number of simulations of all runs by the tuner."""
+TUNER_TIME_LIMIT_SECONDS = 300.0
+"""Time limit of the tuner, in seconds."""
 
 
 class Horizon(NamedTuple):
@@ -173,9 +175,6 @@ def fit_base_model(
     # 3. Derivatives at the fitted model, by initial states. All later fits share them. Without a
     # filter, they were computed about the first start, far from the fitted model.
     if evaluator.has_linearisation and evaluator.filtered_runs is None:
-        # The import is local, because only robots need it.
-        from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
-
         compute_state_jacobian(evaluator, best.theta, best.initial_states, is_recomputed=True)
         best = BaseFit(best, frozenset()).refit(evaluator, noise).fit
 
@@ -314,28 +313,6 @@ def _is_sensitive(
     return float(change_norm) > MIN_SENSITIVITY_SIGMAS
 
 
-def _list_wider_bounds(evaluator: RunEvaluator, base: BaseFit) -> dict[str, Bounds]:
-    """Return wider ranges of fitted base parameters that are at a bound of their range, by name.
-
-    Parameters for which physics does not allow values beyond this bound are not included.
-
-    Args:
-        evaluator: the runs, with the present range of each parameter.
-        base: fit of the base model within these ranges.
-    """
-    wider_bounds = {}
-    for index in evaluator.base_indices.tolist():
-        parameter = evaluator.parameters[index]
-        low, high = parameter.bounds
-        # The end of the range at which the fitted value lies, "low" or "high"; None inside.
-        bound = bound_of(float(base.fit.theta[index]), low, high)
-        lower, upper = widen_range(parameter, get_physical_limits(evaluator, index))
-        is_widened = (bound == "low" and lower < low) or (bound == "high" and upper > high)
-        if is_widened and index not in base.fixed_parameters:
-            wider_bounds[parameter.name] = lower, upper
-    return wider_bounds
-
-
 def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
     """Widen the ranges of parameters that are at a bound, and fit the base model again.
 
@@ -351,18 +328,12 @@ def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> Base
         The base model; the same if no range was widened.
     """
     for _ in range(MAX_WIDENING_ROUNDS):
-        wider_bounds = _list_wider_bounds(evaluator, base)
+        wider_bounds = list_wider_bounds(evaluator, base.fit.theta, base.fixed_parameters)
         if not wider_bounds or evaluator.search_control.is_over():
             break
         use_bounds(evaluator, wider_bounds)
         base = base.refit(evaluator, noise)
     return base
-
-
-SIMULATION_BUDGET = 60
-"""Maximum number of simulations of all runs by the tuner."""
-TIME_LIMIT_SECONDS = 300.0
-"""Time limit of the tuner, in seconds."""
 
 
 def find_start_with_tuner(
@@ -394,7 +365,11 @@ def find_start_with_tuner(
         evaluate=lambda base: _evaluate_base(evaluator, noise, observed, base),
     )
     return run_tuner(
-        name, problem, SIMULATION_BUDGET, TIME_LIMIT_SECONDS, make_rng("explain", name, seed)
+        name,
+        problem,
+        TUNER_SIMULATION_BUDGET,
+        TUNER_TIME_LIMIT_SECONDS,
+        make_rng("explain", name, seed),
     )
 
 

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt step for shared parameters and initial states, and its difference steps.
+"""Levenberg-Marquardt fit of shared parameters and initial states: step, damping and convergence.
 
 Run i has the residual r_i. The shared parameters x change it by A_i, and the initial state z_i of
 the run changes it by B_i. The prior of z_i has mean g_i and standard deviation π. The cost is
@@ -25,18 +25,16 @@ The work therefore grows linearly with the number of runs. If r were linear, (1)
 
     Σ |r_i|² - |r_i - A_i δx - B_i δz_i|² + Σ |d_i|² - |d_i + δz_i / π|²                         (6)
 
-State of one Levenberg-Marquardt fit: point, Jacobian, damping and convergence.
-
 For a step with predicted decrease p that changed the cost from F to F', the gain ratio is
 
-    ρ = (F - F') / p                                                                             (1)
+    ρ = (F - F') / p                                                                             (7)
 
 The damping λ follows ρ by Nielsen's rule (H. B. Nielsen, Damping parameter in Marquardt's method,
 IMM-REP-1999-05), but it changes faster in both directions: the original minimum factor is 1/3, the
 original growth is ν λ.
 
-    λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        if F' < F, and the step is accepted            (2)
-    λ ← 2ν λ,                        ν ← 2ν       otherwise                                      (3)
+    λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        if F' < F, and the step is accepted            (8)
+    λ ← 2ν λ,                        ν ← 2ν       otherwise                                      (9)
 
 The cost of a robot is rough, and a step may be wrong at one joint of one run only, such as a joint
 with a stiff servo, whose first velocity the samples hardly show. If only initial states are fitted,
@@ -48,7 +46,7 @@ the change by a step δ, along the step only; D are the scales of the unknowns (
 Comp. 19, 577, 1965, doi:10.1090/S0025-5718-1965-0198670-6; for this method: K. Madsen, H. B.
 Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems, 2004, section 3.3):
 
-    J ← J + (y(x + δ) - y(x) - J δ) δᵀ D⁻² / (δᵀ D⁻² δ)                                          (4)
+    J ← J + (y(x + δ) - y(x) - J δ) δᵀ D⁻² / (δᵀ D⁻² δ)                                         (10)
 
 They are recomputed when predictions become poor: when ρ is far from 1, or F has increased.
 """
@@ -68,281 +66,33 @@ from sims.core.simulator import Array
 MIN_DIAGONAL = 1e-12
 """Minimum diagonal element of U, so that unknowns without any response are damped."""
 RIDGE_SHARE = 1e-9
-"""Share of its diagonal that is always added to U.
+"""Share of its diagonal that is always added to U, or to the normal matrix of `solve_damped`.
 
 Without it, parameters with the same response would make U singular if there is no damping.
 """
 
+INITIAL_DAMPING = 1e-3
+"""Initial damping λ of (8)."""
+MIN_DAMPING = 1e-10
+"""Minimum damping λ; a damping of zero could not grow again."""
+MAX_DAMPING = 1e8
+"""Maximum damping λ; above it no step decreases the cost, however short."""
+INITIAL_DAMPING_GROWTH = 2.0
+"""Initial growth factor ν of (9), and the factor by which ν itself grows."""
+MIN_DAMPING_FACTOR = 0.1
+"""Minimum factor of (8) by which the damping changes after an accepted step."""
+MAX_LOSS_SHARE = 0.75
+"""Maximum difference of a predicted and an actual decrease of a squared residual, as a share of the
+predicted one, at which the damping of a state does not grow.
+"""
 
-@dataclass(frozen=True)
-class GaussNewtonStep:
-    """A step to try.
+JACOBIAN_REUSE_TOLERANCE = 0.5
+"""Maximum deviation of ρ from 1 at which derivatives are used for another step."""
+SHARED_RENEWALS = 2
+"""Number of recomputed Jacobians after which a fit gets its own derivatives by initial states.
 
-    Attributes:
-        parameter_step: (q,) step of the shared parameters.
-        state_steps: (R, s) step of the initial states.
-        predicted_decrease: predicted decrease of the cost.
-        predicted_decreases: (R, C) predicted decrease of the squared residual of each channel.
-    """
-
-    parameter_step: Array
-    state_steps: Array
-    predicted_decrease: float
-    predicted_decreases: Array
-
-
-@dataclass(frozen=True)
-class _ArrowheadEquations:
-    """The normal equations, eqs. (2) and (3), of R runs, q shared parameters and s initial states.
-
-    Attributes:
-        shared: (q, q) U.
-        cross: (R, q, s) all W_i.
-        inner: (R, s, s) all V_i.
-        gradient: (q,) a.
-        pull: (R, s) all b_i.
-    """
-
-    shared: Array
-    cross: Array
-    inner: Array
-    gradient: Array
-    pull: Array
-
-    def solve(self, blocked_mask: Mask) -> tuple[Array, Array]:
-        """Solve the normal equations for one damped step, by the Schur complement.
-
-        The equations are U dx + sum W_i dz_i = a and, for each run i, W_i' dx + V_i dz_i = b_i,
-        for the step dx of the shared parameters and the steps dz_i of the initial states. The
-        initial states of a run influence only this run, so they are eliminated first. The step of
-        the parameters follows from (U - sum W_i V_i^-1 W_i') dx = a - sum W_i V_i^-1 b_i, eq. (4),
-        and that of the initial states of run i from dz_i = V_i^-1 b_i - V_i^-1 W_i' dx, eq. (5).
-        The fields `shared`, `cross`, `inner`, `gradient` and `pull` are U, W, V, a and b.
-
-        Shapes: R runs, q fitted parameters, s states of a run.
-
-        Args:
-            blocked_mask: (q,) mask of parameters that do not move, because they are at a bound.
-
-        Returns:
-            The steps of the shared parameters (q,) and of the initial states (R, s); NaN if the
-            derivatives give no usable step.
-        """
-        # The matrix of (4), and V⁻¹ Wᵀ of all runs.
-        schur, inverse_cross = compute_schur_complement(self.shared, self.cross, self.inner)
-        # V⁻¹ b of all runs.
-        columns = self.pull[:, :, None]
-        inverse_pull = np.linalg.solve(self.inner, columns)[:, :, 0]
-
-        # Right-hand side of (4).
-        right_hand_side = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
-
-        parameter_step = np.zeros(len(right_hand_side))
-        is_free = ~blocked_mask
-        if is_free.any():
-            free = schur[np.ix_(is_free, is_free)]
-            # Scale the parameters: curvatures of an outlet of 1e-6 m^2 and of a lag of seconds
-            # differ by more than double precision resolves, and the smaller one would be treated as
-            # zero.
-            scale = np.sqrt(np.maximum(np.diagonal(self.shared)[is_free], MIN_DIAGONAL))
-            scaled = free / np.outer(scale, scale)
-            # Derivatives of an unstable motion give no usable step.
-            if not np.isfinite(scaled).all():
-                return np.full(len(right_hand_side), np.nan), np.full(self.pull.shape, np.nan)
-            # Least squares takes the shortest step if parameters have the same response.
-            solution = np.linalg.lstsq(scaled, right_hand_side[is_free] / scale, rcond=None)
-            parameter_step[is_free] = solution[0] / scale
-
-        state_steps = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, parameter_step)  # (5)
-        return parameter_step, state_steps
-
-
-def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, Array]:
-    """Eliminate the initial states of every run from the normal equations.
-
-    The normal equations are U dx + sum_i W_i dz_i = a and W_i' dx + V_i dz_i = b_i, for the steps
-    dx of the shared parameters and dz_i of the initial state of run i. The Schur complement U -
-    sum_i W_i V_i^-1 W_i' is the matrix of eq. (4) of the module docstring, the equations of the
-    shared parameters alone.
-
-    Shapes: R runs, q fitted parameters, s states of a run.
-
-    Args:
-        shared: (q, q) matrix U of the shared parameters.
-        cross: (R, q, s) matrix W_i of each run, which couples parameters and initial states.
-        inner: (R, s, s) matrix V_i of the initial states of each run.
-
-    Returns:
-        The Schur complement (q, q), and all V_i⁻¹ W_iᵀ (R, s, q).
-    """
-    transposed = cross.transpose(0, 2, 1)
-    inverse_cross = np.asarray(np.linalg.solve(inner, transposed), dtype=np.float64)
-    products = np.matmul(cross, inverse_cross)
-    schur_complement: Array = shared - products.sum(axis=0)
-    return schur_complement, inverse_cross
-
-
-def hold_known_states(inner: Array, cross: Array, known_mask: Mask) -> tuple[Array, Array]:
-    """Fix known initial states in the normal equations of a Gauss-Newton step.
-
-    The equation of a known state becomes: its step is zero. No parameter and no other state is
-    coupled to it. The caller sets the right-hand side of this equation to zero.
-
-    Shapes: R runs, q fitted parameters, s states of a run.
-
-    Args:
-        inner: (R, s, s) matrix V_i of the initial states of each run.
-        cross: (R, q, s) matrix W_i of each run, which couples parameters and initial states.
-        known_mask: (R, s) mask of known initial states.
-
-    Returns:
-        The changed V_i and W_i.
-    """
-    # Elements in the row or the column of a known state become those of the identity matrix.
-    is_coupled = known_mask[:, :, None] | known_mask[:, None, :]
-    decoupled = np.where(is_coupled, np.eye(inner.shape[1]), inner)
-    return decoupled, np.where(known_mask[:, None, :], 0.0, cross)
-
-
-def compute_gauss_newton_step(
-    residual: Array,
-    jacobian: Array,
-    q: int,
-    drift: Array,
-    prior: Array,
-    known_mask: Mask,
-    damping: float,
-    state_damping: Array,
-    blocked_mask: Mask,
-) -> GaussNewtonStep:
-    """Compute one damped Gauss-Newton step of parameters and initial states.
-
-    1. Assemble the normal equations, and add the damping.
-    2. Solve them.
-    3. Predict the decrease of the cost, with which the damping is adapted later.
-
-    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
-
-    Args:
-        residual: (R, T, C) whitened residual, observed minus simulated.
-        jacobian: (R, T, C, q + s) whitened derivatives of the simulation; initial states last.
-        q: number q of shared parameters.
-        drift: (R, s) deviations d of the initial states from their guesses, in units of the prior.
-        prior: (s,) standard deviation π of each initial state about its guess, eq. (1).
-        known_mask: (R, s) mask of initial states that do not move, because they are known.
-        damping: Levenberg-Marquardt damping λ of the parameters.
-        state_damping: (R, s) damping of each initial state.
-        blocked_mask: (q,) mask of parameters that do not move, because they are at a bound.
-    """
-    runs, size = len(residual), jacobian.shape[3]
-    run_jacobians = jacobian.reshape(runs, -1, size)
-    run_residuals = residual.reshape(runs, -1)
-    # 1. Equations.
-    equations = _apply_damping(
-        _assemble_normal_equations(run_jacobians, run_residuals, q, drift, prior),
-        damping,
-        state_damping,
-        known_mask,
-    )
-    # 2. Solution.
-    parameter_step, state_steps = equations.solve(blocked_mask)
-    # 3. Decrease.
-    decreases = _predict_decreases(residual, jacobian, parameter_step, state_steps)
-    remaining_drift = drift + state_steps / prior
-    predicted_decrease = decreases.sum() + (drift**2 - remaining_drift**2).sum()  # (6)
-    return GaussNewtonStep(parameter_step, state_steps, float(predicted_decrease), decreases)
-
-
-def _assemble_normal_equations(
-    jacobian: Array,
-    residual: Array,
-    q: int,
-    drift: Array,
-    prior: Array,
-) -> _ArrowheadEquations:
-    """Assemble the normal equations, eqs. (2) and (3), of all runs, without damping.
-
-    They are U dx + sum_i W_i dz_i = a and W_i' dx + V_i dz_i = b_i, for the step dx of the
-    parameters and the step dz_i of the initial state of each run. With the derivatives A_i by the
-    parameters, B_i by the initial state, and the residual r_i: U = sum A_i'A_i, W_i = A_i'B_i, V_i
-    = B_i'B_i + 1 / pi^2, a = sum A_i'r_i, b_i = B_i'r_i - d_i / pi.
-
-    Shapes: R runs, q fitted parameters, s states of a run.
-
-    Args:
-        jacobian: (R, n, q + s) whitened derivatives, those by initial states last; n samples.
-        residual: (R, n) whitened residuals.
-        q: number q of shared parameters.
-        drift: (R, s) deviations d of the initial states from their guesses, eq. (1).
-        prior: (s,) standard deviation π of each initial state about its guess, eq. (1).
-    """
-    state_columns = slice(q, jacobian.shape[2])
-    # One product contains all AᵀA, AᵀB and BᵀB, another one all Aᵀr and Bᵀr.
-    transposed = jacobian.transpose(0, 2, 1)
-    normal = np.matmul(transposed, jacobian)
-    residuals = residual[:, :, None]
-    right_hand_side = np.matmul(transposed, residuals)[:, :, 0]
-    return _ArrowheadEquations(
-        shared=normal[:, :q, :q].sum(axis=0),  # U
-        cross=normal[:, :q, state_columns].copy(),  # W
-        inner=normal[:, state_columns, state_columns] + np.diag(1.0 / prior**2),  # V
-        gradient=right_hand_side[:, :q].sum(axis=0),  # a
-        pull=right_hand_side[:, state_columns] - drift / prior,  # b
-    )
-
-
-def _apply_damping(
-    equations: _ArrowheadEquations, damping: float, state_damping: Array, known_mask: Mask
-) -> _ArrowheadEquations:
-    """Add the damping to the normal equations, and hold known initial states fixed.
-
-    A small ridge is always added to U, so that it can be inverted if two parameters have the same
-    response.
-
-    Shapes: R runs, q fitted parameters, s states of a run.
-
-    Args:
-        equations: normal equations with the blocks U of the parameters and V of the initial states.
-        damping: damping λ of the parameters, without unit; it is multiplied by the diagonal of U.
-        state_damping: (R, s) damping of each initial state, for the diagonal of V.
-        known_mask: (R, s) mask of the known initial states.
-    """
-    # Diagonals of all V, (R, s).
-    diagonal = np.einsum("rii->ri", equations.inner)
-    added = state_damping * diagonal
-    inner = equations.inner + added[:, :, None] * np.eye(equations.inner.shape[1])
-    inner, cross = hold_known_states(inner, equations.cross, known_mask)
-    pull = np.where(known_mask, 0.0, equations.pull)
-
-    # Diagonal of U, (q,).
-    scale = np.maximum(np.diagonal(equations.shared), MIN_DIAGONAL)
-    shared = equations.shared + np.diag(damping * scale + RIDGE_SHARE * scale + MIN_DIAGONAL)
-    return _ArrowheadEquations(shared, cross, inner, equations.gradient, pull)
-
-
-def _predict_decreases(
-    residual: Array, jacobian: Array, parameter_step: Array, state_steps: Array
-) -> Array:
-    """Return by how much a step would decrease the squared residuals (R, C) if they were linear.
-
-    Their sum is the first part of eq. (6): for run i, |r_i|^2 - |r_i - A_i dx - B_i dz_i|^2 with
-    the derivatives A_i by the parameters and B_i by the initial state. The damping is adapted to
-    how well the actual decreases agree with them.
-
-    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
-
-    Args:
-        residual: (R, T, C) whitened residuals r.
-        jacobian: (R, T, C, q + s) whitened derivatives, those by initial states last.
-        parameter_step: (q,) step dx of the shared parameters.
-        state_steps: (R, s) steps dz of the initial states.
-    """
-    repeated = np.tile(parameter_step, (len(residual), 1))
-    steps = np.concatenate([repeated, state_steps], axis=1)
-    remaining = residual - np.matmul(jacobian, steps[:, None, :, None])[..., 0]
-    decreases: Array = (residual**2 - remaining**2).sum(axis=1)
-    return decreases
-
+It applies to models near the data; other models share these derivatives.
+"""
 
 CONVERGENCE_TOLERANCE = 0.02
 """Convergence threshold: minimum decrease of the sum of squares by a step, in units of the noise.
@@ -367,7 +117,7 @@ FAR_MEAN_SQUARE = 2.0
 UNRELIABLE_MEAN_SQUARES = (1.05, 10.0)
 """Mean squared residuals, in units of the noise, that wrong first positions may leave."""
 STAGNANT_RATIO = 0.3
-"""Maximum gain ratio (1) of a step that ends a fit far from the data."""
+"""Maximum gain ratio (7) of a step that ends a fit far from the data."""
 STAGNANT_SHARE = 5e-3
 """Maximum gain of a step that ends a fit far from the data, as a share of the sum of squares."""
 ROUGHNESS = 3.0
@@ -378,30 +128,6 @@ predicted.
 """
 EXACT_ROUGHNESS = 1.0
 """Value that replaces `ROUGHNESS` in fits whose parameters are reported."""
-
-INITIAL_DAMPING = 1e-3
-"""Initial damping λ of (2)."""
-MIN_DAMPING = 1e-10
-"""Minimum damping λ; a damping of zero could not grow again."""
-MAX_DAMPING = 1e8
-"""Maximum damping λ; above it no step decreases the cost, however short."""
-INITIAL_DAMPING_GROWTH = 2.0
-"""Initial growth factor ν of (3), and the factor by which ν itself grows."""
-MIN_DAMPING_FACTOR = 0.1
-"""Minimum factor of (2) by which the damping changes after an accepted step."""
-MAX_LOSS_SHARE = 0.75
-"""Maximum difference of a predicted and an actual decrease of a squared residual, as a share of the
-predicted one, at which the damping of a state does not grow.
-"""
-JACOBIAN_REUSE_TOLERANCE = 0.5
-"""Maximum deviation of ρ from 1 at which derivatives are used for another step."""
-
-
-SHARED_RENEWALS = 2
-"""Number of recomputed Jacobians after which a fit gets its own derivatives by initial states.
-
-It applies to models near the data; other models share these derivatives.
-"""
 
 
 class KnownJacobian(NamedTuple):
@@ -519,18 +245,6 @@ class FitPoint:
     simulated: Array
     jacobian: Array
     cost: float
-
-
-def reduce_damping(damping: Array | float, gain_ratio: Array | float) -> Array:
-    """Return the damping after an accepted step with a gain ratio, eq. (2) of the module docstring.
-
-    Args:
-        damping: damping λ; a number or any shape.
-        gain_ratio: gain ratio ρ of the same shape.
-    """
-    factor = np.maximum(MIN_DAMPING_FACTOR, 1.0 - (2.0 * np.asarray(gain_ratio) - 1.0) ** 3)
-    reduced: Array = np.maximum(damping * factor, MIN_DAMPING)
-    return reduced
 
 
 @dataclass
@@ -709,7 +423,7 @@ class FitState:
         """Return the Jacobian (R, T, C, q + s) at a new point by Broyden's update.
 
         For the simulation y, a step delta of the unknowns x and their scales D (the difference
-        steps), J <- J + (y(x + delta) - y(x) - J delta) delta' D^-2 / (delta' D^-2 delta), eq. (4)
+        steps), J <- J + (y(x + delta) - y(x) - J delta) delta' D^-2 / (delta' D^-2 delta), eq. (10)
         of the module docstring. Each run is updated separately.
 
         Shapes: R runs, T samples, C channels, q fitted parameters.
@@ -739,7 +453,7 @@ class FitState:
         prediction_error = observed_change - np.einsum("rtcq,rq->rtc", point.jacobian, displacement)
         updated_jacobian: Array = (
             point.jacobian + prediction_error[..., None] * broyden_weights[:, None, None, :]
-        )  # (4)
+        )  # (10)
         return updated_jacobian
 
     def mark_converged(self) -> None:
@@ -757,7 +471,7 @@ class FitState:
         """Update the damping and the convergence state after a step that has decreased the cost.
 
         With the gain ratio rho (actual by predicted decrease), the damping becomes lambda max(0.1,
-        1 - (2 rho - 1)^3), and its growth factor nu = 2, eq. (2). The fit ends if it has converged,
+        1 - (2 rho - 1)^3), and its growth factor nu = 2, eq. (8). The fit ends if it has converged,
         stagnates far from the data, or if the cost is too rough to predict.
 
         Args:
@@ -767,7 +481,7 @@ class FitState:
                 began.
         """
         # The minimum avoids a division by zero.
-        gain_ratio = decrease / max(self.predicted_decrease, 1e-300)  # (1)
+        gain_ratio = decrease / max(self.predicted_decrease, 1e-300)  # (7)
         is_predicted = abs(gain_ratio - 1.0) <= JACOBIAN_REUSE_TOLERANCE
         # `has_own_jacobian` is about the new point: updated derivatives serve for another step
         # only if this step was predicted well.
@@ -792,8 +506,8 @@ class FitState:
 
         The channels of a state are those that show it best: position and velocity of its joint. If
         their squared residual decreased far less than predicted, the damping lambda of the state
-        becomes 2 nu lambda with its growth factor nu, which is doubled, eq. (3). Otherwise lambda
-        follows the gain ratio (actual by predicted decrease), eq. (2), if the run takes the step.
+        becomes 2 nu lambda with its growth factor nu, which is doubled, eq. (9). Otherwise lambda
+        follows the gain ratio (actual by predicted decrease), eq. (8), if the run takes the step.
 
         Shapes: R runs, C channels, s states of a run.
 
@@ -825,7 +539,7 @@ class FitState:
            may have caused the bad step, so they are recomputed.
         2. Otherwise a fit with a rough cost ends if it can hardly gain anything.
         3. Otherwise the next step is shorter: the damping lambda becomes 2 nu lambda, and its
-           growth factor nu becomes 2 nu, eq. (3).
+           growth factor nu becomes 2 nu, eq. (9).
         """
         # 1. Derivatives.
         if not self.has_own_jacobian:
@@ -862,6 +576,18 @@ class FitState:
         return is_blocked
 
 
+def reduce_damping(damping: Array | float, gain_ratio: Array | float) -> Array:
+    """Return the damping after an accepted step with a gain ratio, eq. (8) of the module docstring.
+
+    Args:
+        damping: damping λ; a number or any shape.
+        gain_ratio: gain ratio ρ of the same shape.
+    """
+    factor = np.maximum(MIN_DAMPING_FACTOR, 1.0 - (2.0 * np.asarray(gain_ratio) - 1.0) ** 3)
+    reduced: Array = np.maximum(damping * factor, MIN_DAMPING)
+    return reduced
+
+
 def combine_runs(last: FitPoint, trial: FitPoint, is_moved: Mask, costs: Array) -> FitPoint:
     """Return the trial point in some runs, and the last point in the others.
 
@@ -880,6 +606,276 @@ def combine_runs(last: FitPoint, trial: FitPoint, is_moved: Mask, costs: Array) 
         simulated=np.where(is_moved[:, None, None], trial.simulated, last.simulated),
         cost=float(costs.sum()),
     )
+
+
+@dataclass(frozen=True)
+class GaussNewtonStep:
+    """A step to try.
+
+    Attributes:
+        parameter_step: (q,) step of the shared parameters.
+        state_steps: (R, s) step of the initial states.
+        predicted_decrease: predicted decrease of the cost.
+        predicted_decreases: (R, C) predicted decrease of the squared residual of each channel.
+    """
+
+    parameter_step: Array
+    state_steps: Array
+    predicted_decrease: float
+    predicted_decreases: Array
+
+
+def compute_gauss_newton_step(
+    residual: Array,
+    jacobian: Array,
+    q: int,
+    drift: Array,
+    prior: Array,
+    known_mask: Mask,
+    damping: float,
+    state_damping: Array,
+    blocked_mask: Mask,
+) -> GaussNewtonStep:
+    """Compute one damped Gauss-Newton step of parameters and initial states.
+
+    1. Assemble the normal equations, and add the damping.
+    2. Solve them.
+    3. Predict the decrease of the cost, with which the damping is adapted later.
+
+    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
+
+    Args:
+        residual: (R, T, C) whitened residual, observed minus simulated.
+        jacobian: (R, T, C, q + s) whitened derivatives of the simulation; initial states last.
+        q: number q of shared parameters.
+        drift: (R, s) deviations d of the initial states from their guesses, in units of the prior.
+        prior: (s,) standard deviation π of each initial state about its guess, eq. (1).
+        known_mask: (R, s) mask of initial states that do not move, because they are known.
+        damping: Levenberg-Marquardt damping λ of the parameters.
+        state_damping: (R, s) damping of each initial state.
+        blocked_mask: (q,) mask of parameters that do not move, because they are at a bound.
+    """
+    runs, size = len(residual), jacobian.shape[3]
+    run_jacobians = jacobian.reshape(runs, -1, size)
+    run_residuals = residual.reshape(runs, -1)
+    # 1. Equations.
+    equations = _apply_damping(
+        _assemble_normal_equations(run_jacobians, run_residuals, q, drift, prior),
+        damping,
+        state_damping,
+        known_mask,
+    )
+    # 2. Solution.
+    parameter_step, state_steps = equations.solve(blocked_mask)
+    # 3. Decrease.
+    decreases = _predict_decreases(residual, jacobian, parameter_step, state_steps)
+    remaining_drift = drift + state_steps / prior
+    predicted_decrease = decreases.sum() + (drift**2 - remaining_drift**2).sum()  # (6)
+    return GaussNewtonStep(parameter_step, state_steps, float(predicted_decrease), decreases)
+
+
+@dataclass(frozen=True)
+class _ArrowheadEquations:
+    """The normal equations, eqs. (2) and (3), of R runs, q shared parameters and s initial states.
+
+    Attributes:
+        shared: (q, q) U.
+        cross: (R, q, s) all W_i.
+        inner: (R, s, s) all V_i.
+        gradient: (q,) a.
+        pull: (R, s) all b_i.
+    """
+
+    shared: Array
+    cross: Array
+    inner: Array
+    gradient: Array
+    pull: Array
+
+    def solve(self, blocked_mask: Mask) -> tuple[Array, Array]:
+        """Solve the normal equations for one damped step, by the Schur complement.
+
+        The equations are U dx + sum W_i dz_i = a and, for each run i, W_i' dx + V_i dz_i = b_i,
+        for the step dx of the shared parameters and the steps dz_i of the initial states. The
+        initial states of a run influence only this run, so they are eliminated first. The step of
+        the parameters follows from (U - sum W_i V_i^-1 W_i') dx = a - sum W_i V_i^-1 b_i, eq. (4),
+        and that of the initial states of run i from dz_i = V_i^-1 b_i - V_i^-1 W_i' dx, eq. (5).
+        The fields `shared`, `cross`, `inner`, `gradient` and `pull` are U, W, V, a and b.
+
+        Shapes: R runs, q fitted parameters, s states of a run.
+
+        Args:
+            blocked_mask: (q,) mask of parameters that do not move, because they are at a bound.
+
+        Returns:
+            The steps of the shared parameters (q,) and of the initial states (R, s); NaN if the
+            derivatives give no usable step.
+        """
+        # The matrix of (4), and V⁻¹ Wᵀ of all runs.
+        schur, inverse_cross = compute_schur_complement(self.shared, self.cross, self.inner)
+        # V⁻¹ b of all runs.
+        columns = self.pull[:, :, None]
+        inverse_pull = np.linalg.solve(self.inner, columns)[:, :, 0]
+
+        # Right-hand side of (4).
+        right_hand_side = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
+
+        parameter_step = np.zeros(len(right_hand_side))
+        is_free = ~blocked_mask
+        if is_free.any():
+            free = schur[np.ix_(is_free, is_free)]
+            # Scale the parameters: curvatures of an outlet of 1e-6 m^2 and of a lag of seconds
+            # differ by more than double precision resolves, and the smaller one would be treated as
+            # zero.
+            scale = np.sqrt(np.maximum(np.diagonal(self.shared)[is_free], MIN_DIAGONAL))
+            scaled = free / np.outer(scale, scale)
+            # Derivatives of an unstable motion give no usable step.
+            if not np.isfinite(scaled).all():
+                return np.full(len(right_hand_side), np.nan), np.full(self.pull.shape, np.nan)
+            # Least squares takes the shortest step if parameters have the same response.
+            solution = np.linalg.lstsq(scaled, right_hand_side[is_free] / scale, rcond=None)
+            parameter_step[is_free] = solution[0] / scale
+
+        state_steps = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, parameter_step)  # (5)
+        return parameter_step, state_steps
+
+
+def _assemble_normal_equations(
+    jacobian: Array,
+    residual: Array,
+    q: int,
+    drift: Array,
+    prior: Array,
+) -> _ArrowheadEquations:
+    """Assemble the normal equations, eqs. (2) and (3), of all runs, without damping.
+
+    They are U dx + sum_i W_i dz_i = a and W_i' dx + V_i dz_i = b_i, for the step dx of the
+    parameters and the step dz_i of the initial state of each run. With the derivatives A_i by the
+    parameters, B_i by the initial state, and the residual r_i: U = sum A_i'A_i, W_i = A_i'B_i, V_i
+    = B_i'B_i + 1 / pi^2, a = sum A_i'r_i, b_i = B_i'r_i - d_i / pi.
+
+    Shapes: R runs, q fitted parameters, s states of a run.
+
+    Args:
+        jacobian: (R, n, q + s) whitened derivatives, those by initial states last; n samples.
+        residual: (R, n) whitened residuals.
+        q: number q of shared parameters.
+        drift: (R, s) deviations d of the initial states from their guesses, eq. (1).
+        prior: (s,) standard deviation π of each initial state about its guess, eq. (1).
+    """
+    state_columns = slice(q, jacobian.shape[2])
+    # One product contains all AᵀA, AᵀB and BᵀB, another one all Aᵀr and Bᵀr.
+    transposed = jacobian.transpose(0, 2, 1)
+    normal = np.matmul(transposed, jacobian)
+    residuals = residual[:, :, None]
+    right_hand_side = np.matmul(transposed, residuals)[:, :, 0]
+    return _ArrowheadEquations(
+        shared=normal[:, :q, :q].sum(axis=0),  # U
+        cross=normal[:, :q, state_columns].copy(),  # W
+        inner=normal[:, state_columns, state_columns] + np.diag(1.0 / prior**2),  # V
+        gradient=right_hand_side[:, :q].sum(axis=0),  # a
+        pull=right_hand_side[:, state_columns] - drift / prior,  # b
+    )
+
+
+def _apply_damping(
+    equations: _ArrowheadEquations, damping: float, state_damping: Array, known_mask: Mask
+) -> _ArrowheadEquations:
+    """Add the damping to the normal equations, and hold known initial states fixed.
+
+    A small ridge is always added to U, so that it can be inverted if two parameters have the same
+    response.
+
+    Shapes: R runs, q fitted parameters, s states of a run.
+
+    Args:
+        equations: normal equations with the blocks U of the parameters and V of the initial states.
+        damping: damping λ of the parameters, without unit; it is multiplied by the diagonal of U.
+        state_damping: (R, s) damping of each initial state, for the diagonal of V.
+        known_mask: (R, s) mask of the known initial states.
+    """
+    # Diagonals of all V, (R, s).
+    diagonal = np.einsum("rii->ri", equations.inner)
+    added = state_damping * diagonal
+    inner = equations.inner + added[:, :, None] * np.eye(equations.inner.shape[1])
+    inner, cross = hold_known_states(inner, equations.cross, known_mask)
+    pull = np.where(known_mask, 0.0, equations.pull)
+
+    # Diagonal of U, (q,).
+    scale = np.maximum(np.diagonal(equations.shared), MIN_DIAGONAL)
+    shared = equations.shared + np.diag(damping * scale + RIDGE_SHARE * scale + MIN_DIAGONAL)
+    return _ArrowheadEquations(shared, cross, inner, equations.gradient, pull)
+
+
+def hold_known_states(inner: Array, cross: Array, known_mask: Mask) -> tuple[Array, Array]:
+    """Fix known initial states in the normal equations of a Gauss-Newton step.
+
+    The equation of a known state becomes: its step is zero. No parameter and no other state is
+    coupled to it. The caller sets the right-hand side of this equation to zero.
+
+    Shapes: R runs, q fitted parameters, s states of a run.
+
+    Args:
+        inner: (R, s, s) matrix V_i of the initial states of each run.
+        cross: (R, q, s) matrix W_i of each run, which couples parameters and initial states.
+        known_mask: (R, s) mask of known initial states.
+
+    Returns:
+        The changed V_i and W_i.
+    """
+    # Elements in the row or the column of a known state become those of the identity matrix.
+    is_coupled = known_mask[:, :, None] | known_mask[:, None, :]
+    decoupled = np.where(is_coupled, np.eye(inner.shape[1]), inner)
+    return decoupled, np.where(known_mask[:, None, :], 0.0, cross)
+
+
+def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, Array]:
+    """Eliminate the initial states of every run from the normal equations.
+
+    The normal equations are U dx + sum_i W_i dz_i = a and W_i' dx + V_i dz_i = b_i, for the steps
+    dx of the shared parameters and dz_i of the initial state of run i. The Schur complement U -
+    sum_i W_i V_i^-1 W_i' is the matrix of eq. (4) of the module docstring, the equations of the
+    shared parameters alone.
+
+    Shapes: R runs, q fitted parameters, s states of a run.
+
+    Args:
+        shared: (q, q) matrix U of the shared parameters.
+        cross: (R, q, s) matrix W_i of each run, which couples parameters and initial states.
+        inner: (R, s, s) matrix V_i of the initial states of each run.
+
+    Returns:
+        The Schur complement (q, q), and all V_i⁻¹ W_iᵀ (R, s, q).
+    """
+    transposed = cross.transpose(0, 2, 1)
+    inverse_cross = np.asarray(np.linalg.solve(inner, transposed), dtype=np.float64)
+    products = np.matmul(cross, inverse_cross)
+    schur_complement: Array = shared - products.sum(axis=0)
+    return schur_complement, inverse_cross
+
+
+def _predict_decreases(
+    residual: Array, jacobian: Array, parameter_step: Array, state_steps: Array
+) -> Array:
+    """Return by how much a step would decrease the squared residuals (R, C) if they were linear.
+
+    Their sum is the first part of eq. (6): for run i, |r_i|^2 - |r_i - A_i dx - B_i dz_i|^2 with
+    the derivatives A_i by the parameters and B_i by the initial state. The damping is adapted to
+    how well the actual decreases agree with them.
+
+    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
+
+    Args:
+        residual: (R, T, C) whitened residuals r.
+        jacobian: (R, T, C, q + s) whitened derivatives, those by initial states last.
+        parameter_step: (q,) step dx of the shared parameters.
+        state_steps: (R, s) steps dz of the initial states.
+    """
+    repeated = np.tile(parameter_step, (len(residual), 1))
+    steps = np.concatenate([repeated, state_steps], axis=1)
+    remaining = residual - np.matmul(jacobian, steps[:, None, :, None])[..., 0]
+    decreases: Array = (residual**2 - remaining**2).sum(axis=1)
+    return decreases
 
 
 def solve_damped(block: Array, residual: Array, damping: float) -> Array:

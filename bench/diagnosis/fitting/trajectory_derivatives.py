@@ -1,6 +1,9 @@
-"""Linearised robot runs: their responses to effects and to initial states.
+"""Derivatives of the simulated runs, by finite differences and by linearised robot dynamics.
 
-Direction in which an effect changes the simulated runs.
+Finite differences displace one parameter, or one initial state in all runs, and divide the change
+of the observations by the displacement. A fit uses one-sided differences, and covariances use
+central ones. For a robot, the dynamics linearised along each run give the derivatives by initial
+states (`sims.robot.dynamics.linearisation_about_simulation`).
 """
 
 from __future__ import annotations
@@ -40,111 +43,9 @@ Larger values come from an unstable motion, which says nothing about motions nea
 """
 
 
-def compute_state_jacobian(
-    evaluator: RunEvaluator, theta: Array, states: Array, is_recomputed: bool = False
-) -> Array:
-    """Return derivatives (R, T, C, s) of the runs by their initial states.
-
-    They are those about the first requested model, or about this one if `is_recomputed` is set.
-    Initial states act similarly in all models near the data, and a fit with derivatives of another
-    such model converges to the same result.
-
-    Shapes: R runs, T samples, C channels, P parameters, s states of a run.
-
-    Args:
-        evaluator: evaluator that simulates the recorded runs of a robot.
-        theta: (P,) parameters.
-        states: (R, s) initial states.
-        is_recomputed: whether to recompute the derivatives about this model and store them.
-    """
-    if evaluator.state_derivatives is None or is_recomputed:
-        evaluator.state_derivatives = compute_initial_state_derivatives(evaluator, theta, states)
-    return evaluator.state_derivatives
-
-
-def compute_initial_state_derivatives(
-    evaluator: RunEvaluator, theta: Array, states: Array
-) -> Array:
-    """Compute the derivatives (R, T, C, s) of the runs by their initial states about one model.
-
-    Each run is linearised in a worker. Derivatives that are not finite are set to zero.
-
-    Shapes: R runs, T samples, C channels, P parameters, s states of a run.
-
-    Args:
-        evaluator: evaluator that simulates the recorded runs of a robot.
-        theta: (P,) parameters of the model.
-        states: (R, s) initial states of the model.
-    """
-    runs, length, channels = evaluator.observed.shape
-    result = np.zeros((runs, length, channels, len(evaluator.state_names)))
-    calls = [(run, theta, states[run]) for run in range(runs)]
-    for run, values in evaluator.worker_pool.map_unordered(
-        evaluator, _compute_initial_state_derivatives, calls
-    ):
-        result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
-    result[~is_finite_response(result)] = 0.0
-    return result
-
-
-def _compute_initial_state_derivatives(
-    evaluator: RunEvaluator, run: int, theta: Array, states: Array
-) -> Array:
-    """Compute the derivatives (s, T, C) of one run by its initial states; runs in a worker.
-
-    Shapes: T samples, C channels, P parameters, s states of a run.
-
-    Args:
-        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        run: index of the run.
-        theta: (P,) parameters.
-        states: (s,) initial state about which the run is linearised.
-    """
-    return get_linearisation(evaluator, run, theta, states).compute_initial_state_responses()
-
-
-def get_linearisation(
-    evaluator: RunEvaluator, run: int, theta: Array, states: Array
-) -> RunLinearisation:
-    """Return the dynamics of a robot linearised along one run, at given parameters.
-
-    The most recently used linearisations are cached, as many as there are runs, because most are
-    used more than once.
-
-    Shapes: P parameters, s states of a run.
-
-    Args:
-        evaluator: run evaluator of all runs.
-        run: index of the run.
-        theta: (P,) parameters.
-        states: (s,) initial state: positions first, then velocities.
-    """
-    key = run, theta.tobytes(), states.tobytes()
-    cache = evaluator.cached_linearisations
-    linearisation: RunLinearisation | None = cache.pop(key, None)
-    if linearisation is None:
-        # This import is needed for robots only.
-        from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
-
-        coordinate_count = len(evaluator.state_names) // 2
-        scenario = evaluator.prepared_runs[run].scenario
-        linearisation = RunLinearisation(
-            evaluator.simulator,
-            theta,
-            scenario,
-            states[:coordinate_count],
-            states[coordinate_count:],
-        )
-    cache[key] = linearisation
-    # The cache is ordered by the last use. Drop the linearisations unused for the longest time.
-    for oldest_key in list(cache)[: -len(evaluator.prepared_runs)]:
-        del cache[oldest_key]
-    return linearisation
-
-
 @dataclass(frozen=True)
 class CandidateDirection:
-    """One candidate direction.
+    """Direction in which an effect changes the simulated runs, scaled by one coefficient.
 
     Attributes:
         effect: name of the effect.
@@ -164,13 +65,6 @@ class CandidateDirection:
     can_be_negative: bool
     is_single_size: bool = False
     is_only_proposed: bool = False
-
-
-def is_finite_response(changes: Array) -> Mask:
-    """Return a mask of usable changes: not NaN, and of a magnitude below `MAX_RESPONSE`."""
-    # Two comparisons avoid the modulus, which would copy one of the largest arrays.
-    is_finite: Mask = (changes > -MAX_RESPONSE) & (changes < MAX_RESPONSE)
-    return is_finite
 
 
 def build_displaced_inputs(
@@ -228,6 +122,43 @@ def compute_difference_steps(jacobian: Array, noise: NoiseModel, widths: Array) 
     return steps
 
 
+def compute_difference_quotients(
+    simulated: Array, steps: Array, state_indices: Indices, known_state_mask: Mask
+) -> Array:
+    """Compute the Jacobian (R, T, C, q + s) of a fit by one-sided finite differences.
+
+    It is zero for known initial states, which therefore absorb nothing of the residual.
+
+    Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
+
+    Args:
+        simulated: (1 + q + n, R, T, C) simulation of the inputs of `build_displaced_inputs`.
+        steps: (q + s,) displacements of all unknowns, parameters first.
+        state_indices: (n,) indices of the initial states that are displaced.
+        known_state_mask: (R, s) mask of known initial states.
+    """
+    q = steps.size - known_state_mask.shape[1]
+    columns = np.concatenate([np.arange(q), q + state_indices])
+    # An abandoned batch element is NaN, so the derivative by its unknown is not known, and zero.
+    with np.errstate(all="ignore"):
+        quotients = np.moveaxis(simulated[1:] - simulated[0], 0, -1) / steps[columns]
+    jacobian: Array = np.where(is_finite_response(quotients), quotients, 0.0)
+    if columns.size == steps.size:
+        return jacobian
+    # Some states are not displaced, because they are known in all runs; others in some runs.
+    full_jacobian = np.zeros((*simulated.shape[1:], steps.size))
+    full_jacobian[..., columns] = jacobian
+    full_jacobian[..., q:] *= ~known_state_mask[:, None, None, :]
+    return full_jacobian
+
+
+def is_finite_response(changes: Array) -> Mask:
+    """Return a mask of usable changes: not NaN, and of a magnitude below `MAX_RESPONSE`."""
+    # Two comparisons avoid the modulus, which would copy one of the largest arrays.
+    is_finite: Mask = (changes > -MAX_RESPONSE) & (changes < MAX_RESPONSE)
+    return is_finite
+
+
 def compute_central_jacobian(
     evaluator: RunEvaluator, fit: TrajectoryFit, noise: NoiseModel
 ) -> TrajectoryFit:
@@ -237,9 +168,9 @@ def compute_central_jacobian(
     distinguishable that are not.
 
     Args:
-        evaluator: Run evaluator of the runs.
-        fit: Fit with a one-sided Jacobian.
-        noise: Noise that weights the channels.
+        evaluator: run evaluator of the runs.
+        fit: fit with a one-sided Jacobian.
+        noise: noise that weights the channels.
 
     Returns:
         The fit with the new Jacobian.
@@ -313,3 +244,105 @@ def _widen_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> Array:
     # The shape is set explicitly because there may be no parameters.
     low, high = np.array(bounds).reshape(-1, 2).T
     return np.stack([np.minimum(low, values), np.maximum(high, values)], axis=1)
+
+
+def compute_state_jacobian(
+    evaluator: RunEvaluator, theta: Array, states: Array, is_recomputed: bool = False
+) -> Array:
+    """Return derivatives (R, T, C, s) of the runs by their initial states.
+
+    They are those about the first requested model, or about this one if `is_recomputed` is set.
+    Initial states act similarly in all models near the data, and a fit with derivatives of another
+    such model converges to the same result.
+
+    Shapes: R runs, T samples, C channels, P parameters, s states of a run.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs of a robot.
+        theta: (P,) parameters.
+        states: (R, s) initial states.
+        is_recomputed: whether to recompute the derivatives about this model and store them.
+    """
+    if evaluator.state_derivatives is None or is_recomputed:
+        evaluator.state_derivatives = compute_initial_state_derivatives(evaluator, theta, states)
+    return evaluator.state_derivatives
+
+
+def compute_initial_state_derivatives(
+    evaluator: RunEvaluator, theta: Array, states: Array
+) -> Array:
+    """Compute the derivatives (R, T, C, s) of the runs by their initial states about one model.
+
+    Each run is linearised in a worker. Derivatives that are not finite are set to zero.
+
+    Shapes: R runs, T samples, C channels, P parameters, s states of a run.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs of a robot.
+        theta: (P,) parameters of the model.
+        states: (R, s) initial states of the model.
+    """
+    runs, length, channels = evaluator.observed.shape
+    result = np.zeros((runs, length, channels, len(evaluator.state_names)))
+    calls = [(run, theta, states[run]) for run in range(runs)]
+    for run, values in evaluator.worker_pool.map_unordered(
+        evaluator, _compute_run_derivatives, calls
+    ):
+        result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
+    result[~is_finite_response(result)] = 0.0
+    return result
+
+
+def _compute_run_derivatives(
+    evaluator: RunEvaluator, run: int, theta: Array, states: Array
+) -> Array:
+    """Compute the derivatives (s, T, C) of one run by its initial states; runs in a worker.
+
+    Shapes: T samples, C channels, P parameters, s states of a run.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
+        run: index of the run.
+        theta: (P,) parameters.
+        states: (s,) initial state about which the run is linearised.
+    """
+    return get_linearisation(evaluator, run, theta, states).compute_initial_state_responses()
+
+
+def get_linearisation(
+    evaluator: RunEvaluator, run: int, theta: Array, states: Array
+) -> RunLinearisation:
+    """Return the dynamics of a robot linearised along one run, at given parameters.
+
+    The most recently used linearisations are cached, as many as there are runs, because most are
+    used more than once.
+
+    Shapes: P parameters, s states of a run.
+
+    Args:
+        evaluator: run evaluator of all runs.
+        run: index of the run.
+        theta: (P,) parameters.
+        states: (s,) initial state: positions first, then velocities.
+    """
+    key = run, theta.tobytes(), states.tobytes()
+    cache = evaluator.cached_linearisations
+    linearisation: RunLinearisation | None = cache.pop(key, None)
+    if linearisation is None:
+        # This import is needed for robots only.
+        from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
+
+        coordinate_count = len(evaluator.state_names) // 2
+        scenario = evaluator.prepared_runs[run].scenario
+        linearisation = RunLinearisation(
+            evaluator.simulator,
+            theta,
+            scenario,
+            states[:coordinate_count],
+            states[coordinate_count:],
+        )
+    cache[key] = linearisation
+    # The cache is ordered by the last use. Drop the linearisations unused for the longest time.
+    for oldest_key in list(cache)[: -len(evaluator.prepared_runs)]:
+        del cache[oldest_key]
+    return linearisation

@@ -1,9 +1,10 @@
 """Least-squares fit of trajectories with shared parameters and initial states of each run.
 
 Levenberg-Marquardt for many models at once, so that one engine call serves all of them. A single
-step of one model is in `levenberg_marquardt`. AR(1) noise is whitened first (`noise_model`),
-so the fit is a generalised least-squares fit. Parallel fits share their best cost between rounds,
-and those that fall far behind are stopped.
+step of one model, and the state of its fit, are in `levenberg_marquardt`; derivatives are in
+`trajectory_derivatives`. AR(1) noise is whitened first (`noise_model`), so the fit is a generalised
+least-squares fit. Parallel fits share their best cost between rounds, and those that fall far
+behind are stopped.
 """
 
 from __future__ import annotations
@@ -32,8 +33,10 @@ from bench.diagnosis.fitting.trajectory_derivatives import (
     INITIAL_PARAMETER_STEP,
     INITIAL_STATE_STEP,
     build_displaced_inputs,
+    compute_difference_quotients,
     compute_difference_steps,
-    is_finite_response,
+    compute_initial_state_derivatives,
+    compute_state_jacobian,
 )
 from sims.core.effect import is_dry_friction
 from sims.core.simulator import Array
@@ -346,9 +349,7 @@ class TrajectoryFitter:
                 assert known_jacobian is not None
                 # Only the first part of each run may be simulated.
                 sample_count = point.simulated.shape[1]
-                state_jacobian = self._compute_initial_state_derivatives(
-                    fit_state, point.start, sample_count
-                )
+                state_jacobian = self._get_state_derivatives(fit_state, point.start, sample_count)
                 jacobian = np.concatenate(
                     [known_jacobian.jacobian[:, :sample_count], state_jacobian], axis=3
                 )
@@ -404,11 +405,6 @@ class TrajectoryFitter:
         for fit_state in stale_states:
             fit_state.jacobian_renewals += 1
             if fit_state.needs_own_state_jacobian:
-                # Imported here, because only robots need it.
-                from bench.diagnosis.fitting.trajectory_derivatives import (
-                    compute_initial_state_derivatives,
-                )
-
                 if fit_state.has_unreliable_states:
                     self._replace_first_states(fit_state, sample_mask)
                 start = fit_state.point.start
@@ -525,13 +521,13 @@ class TrajectoryFitter:
             end = first + 1 + fit_state.free_indices.size + state_indices.size
             point_simulations = simulated[first:end]
             first = end
-            jacobian = self._compute_derivatives(point_simulations, steps, state_indices)
+            jacobian = compute_difference_quotients(
+                point_simulations, steps, state_indices, self.evaluator.known_state_mask
+            )
             # The last columns are the derivatives by initial states.
             if self.evaluator.has_linearisation:
-                jacobian[..., fit_state.free_indices.size :] = (
-                    self._compute_initial_state_derivatives(
-                        fit_state, start, point_simulations.shape[2]
-                    )
+                jacobian[..., fit_state.free_indices.size :] = self._get_state_derivatives(
+                    fit_state, start, point_simulations.shape[2]
                 )
             cost = self._compute_cost(point_simulations[0], start.initial_states, sample_mask)
             points.append(FitPoint(start, point_simulations[0], jacobian, cost))
@@ -575,9 +571,7 @@ class TrajectoryFitter:
             return np.array([], dtype=np.intp)
         return np.flatnonzero(~self.evaluator.known_state_mask.all(axis=0))
 
-    def _compute_initial_state_derivatives(
-        self, fit_state: FitState, start: FitStart, samples: int
-    ) -> Array:
+    def _get_state_derivatives(self, fit_state: FitState, start: FitStart, samples: int) -> Array:
         """Return the derivatives (R, T, C, s) of the runs by their initial states.
 
         They are zero where a state is known. The derivatives of the fit itself are used, if it has
@@ -591,43 +585,12 @@ class TrajectoryFitter:
             samples: number T of samples of each run, the fitted share.
         """
         evaluator = self.evaluator
-        # Imported here, because only robots need it.
-        from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
-
         state_jacobian = fit_state.own_state_jacobian
         if state_jacobian is None:
             state_jacobian = compute_state_jacobian(evaluator, start.theta, start.initial_states)
         derivatives = state_jacobian[:, :samples]
         masked_derivatives: Array = derivatives * ~evaluator.known_state_mask[:, None, None, :]
         return masked_derivatives
-
-    def _compute_derivatives(self, simulated: Array, steps: Array, state_indices: Indices) -> Array:
-        """Compute the Jacobian (R, T, C, q + s) of a fit by finite differences.
-
-        It is zero for known initial states, which therefore absorb nothing of the residual.
-
-        Shapes: R runs, T samples, C channels, q fitted parameters, s states of a run.
-
-        Args:
-            simulated: (1 + q + n, R, T, C) simulation without and with each unknown displaced.
-            steps: (q + s,) displacements of all unknowns, parameters first.
-            state_indices: (n,) indices of the initial states that are displaced.
-        """
-        known_mask = self.evaluator.known_state_mask
-        q = steps.size - known_mask.shape[1]
-        columns = np.concatenate([np.arange(q), q + state_indices])
-        # An abandoned batch element is NaN, so the derivative by its unknown is not known, and
-        # zero.
-        with np.errstate(all="ignore"):
-            quotients = np.moveaxis(simulated[1:] - simulated[0], 0, -1) / steps[columns]
-        jacobian: Array = np.where(is_finite_response(quotients), quotients, 0.0)
-        if columns.size == steps.size:
-            return jacobian
-        # Some states are not displaced, because they are known in all runs; others in some runs.
-        full_jacobian = np.zeros((*simulated.shape[1:], steps.size))
-        full_jacobian[..., columns] = jacobian
-        full_jacobian[..., q:] *= ~known_mask[:, None, None, :]
-        return full_jacobian
 
     def _move_to_point(self, fit_state: FitState, point: FitPoint) -> None:
         """Move a fit to a point with its derivatives, and adapt the difference steps to them.
@@ -679,8 +642,8 @@ class TrajectoryFitter:
     def _compute_cost(self, simulated: Array, states: Array, sample_mask: Mask) -> float:
         """Return the sum of squares of the whitened residual and of the state deviations.
 
-        This is the cost, eq. (1) of `levenberg_marquardt`: sum_i |r_i|^2 + sum_i |d_i|^2, with
-        the whitened residual r_i of run i and the deviation d_i of its initial state from the prior
+        This is the cost, eq. (1) of `levenberg_marquardt`: sum_i |r_i|^2 + sum_i |d_i|^2, with the
+        whitened residual r_i of run i and the deviation d_i of its initial state from the prior
         mean, in standard deviations. It is infinite if a simulation was abandoned.
 
         Shapes: R runs, T samples, C channels, s states of a run.

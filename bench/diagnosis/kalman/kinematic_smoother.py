@@ -1,14 +1,12 @@
-"""States and joint forces of a robot from its recorded motion alone, without simulation.
+"""Kalman smoother with a kinematic model: states of joints from their readings, without simulation.
 
-Each joint is filtered separately, as a body whose jerk j is constant between samples and otherwise
-unknown,
+Each joint is filtered and smoothed separately, as a body whose jerk j is constant between samples
+and otherwise unknown,
 
     (q, v, a)[i+1] = [[1, h, h²/2], [0, 1, h], [0, 0, 1]] (q, v, a)[i] + (h³/6, h²/2, h) j_i     (1)
 
 (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation,
 2001, section 6.2). The size of the jerk is selected from a grid by maximum likelihood.
-
-Positions, velocities and accelerations are estimated from the readings alone (`track_joints`).
 """
 
 from __future__ import annotations

@@ -15,14 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.diagnosis.evaluation.initial_state_guesses import estimate_resting_position
-from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.kalman.kalman_recursions import (
     MAX_MAGNITUDE,
     SMALLEST_FORCE,
     Filtered,
     LinearRuns,
-    Mask,
     Smoothed,
     add_noise_states,
     filter_runs,

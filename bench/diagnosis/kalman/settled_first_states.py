@@ -18,9 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.kalman.kalman_recursions import Mask
 from bench.diagnosis.kalman.kinematic_smoother import estimate_measured_states
 from sims.core.simulator import Array
 from sims.robot.dynamics.contact_equilibrium import ContactModel, KnownJacobians, settle_contacts

@@ -1,8 +1,8 @@
-"""Fit of the base model of a diagnosis: parameters, ranges, first states, discretisation error."""
+"""Base model of a diagnosis: fit of its parameters, ranges and first states without causes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,24 +17,23 @@ from bench.diagnosis.identifiability import freeze_unidentified_parameters
 from bench.diagnosis.pipeline.run_filtering import filter_simulated_runs
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.search.fit_starts import find_first_states
-from sims.core.simulator import Array
-from sims.recording.recorded_poses import ANGLES
+from bench.diagnosis.verdict import RecordingFault
+from sims.core.simulator import Array, InputError
 
-MAX_ROTATION_ERROR = 0.5
-"""Maximum error in rad of the simulated orientation of a floating body.
-
-Beyond it, the effects of small changes are not linear.
-"""
-SEGMENT_DURATIONS = (1.0, 0.5, 0.25)
-"""Durations in seconds of the segments that are tried if no simulation of whole runs succeeds."""
-MAX_RUN_AMPLIFICATION = 1000.0
-"""Maximum factor by which whole runs may amplify an error of their first positions."""
-MAX_SEGMENT_AMPLIFICATION = 100.0
-"""Maximum factor by which segments may amplify an error of their first positions."""
 MIN_REFITTED_RESIDUAL = 1.05
 """Minimum RMS residual, in units of the noise, at which first states are fitted again."""
-MIN_UNFOLLOWED_RESIDUAL = 3.0
-"""Minimum RMS residual, in units of the noise, of whole runs that are cut into segments."""
+
+
+class DivergingSimulationError(InputError):
+    """Error if no simulation follows the runs, at any starting point of the base fit.
+
+    Attributes:
+        longest_segment: maximum duration in seconds of segments that a simulation may follow.
+    """
+
+    def __init__(self, message: str, longest_segment: float = np.inf) -> None:
+        super().__init__(message)
+        self.longest_segment = longest_segment
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,23 +118,6 @@ class BaseModel:
             )
         return replace(self, fit=fit)
 
-    def shows_step_errors(self) -> bool:
-        """Return whether the recording shows the discretisation error of the engine's steps.
-
-        The innovations of a Kalman filter show it. Without a filter of the runs this is not known,
-        and true is returned.
-        """
-        runs = self.runs
-        if runs.fitting.filtered_runs is None or not self.is_usable:
-            return True
-        # These imports are needed for robots only.
-        from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-        from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
-
-        # The filter with the fitted parameters, which may be the stored one.
-        theta = self.fit.fit.theta
-        return shows_step_errors(FollowedRuns.get_or_follow(runs.fitting, theta, runs.noise))
-
     def correct_step_errors(self) -> BaseModel:
         """Return the base model without the discretisation error of the engine's steps.
 
@@ -187,46 +169,6 @@ class BaseModel:
             return self
         return replace(self, fit=self.fit.refit(runs.fitting, runs.noise, start))
 
-    def find_segment_duration(self) -> float | None:
-        """Return the duration in seconds of segments that a simulation can follow.
-
-        An unstable or chaotic motion amplifies the error of an estimated first state, until no
-        simulation follows it. Shorter segments begin at new first states.
-
-        Returns:
-            The longest of `SEGMENT_DURATIONS` with a small amplification, or the shortest if none
-            has one. None if whole runs can be used: the base model simulates them well, they
-            amplify errors little, or no filter can tell.
-        """
-        followed = self.runs.fitting.filtered_runs
-        if followed is None or not self.is_usable:
-            return None
-        _, residual_rms = self.rate()
-        is_simulated = residual_rms < MIN_UNFOLLOWED_RESIDUAL
-        if is_simulated or not followed.compute_amplification() > MAX_RUN_AMPLIFICATION:
-            return None
-        for seconds in SEGMENT_DURATIONS:
-            if followed.compute_amplification(seconds) <= MAX_SEGMENT_AMPLIFICATION:
-                return seconds
-        return SEGMENT_DURATIONS[-1]
-
-    def loses_orientation(self) -> bool:
-        """Return whether a simulated floating body is far from its recorded orientation.
-
-        Beyond a certain error a fit does not find back; the runs are then divided into shorter
-        segments.
-        """
-        # Channels of the orientation, such as `q.base.yaw`.
-        names = [
-            f"q.{base_name}.{angle}"
-            for base_name in self.runs.kind.system.base_orientations
-            for angle in ANGLES
-        ]
-        evaluator = self.runs.fitting
-        angle_channels = [c for c, name in enumerate(evaluator.channels) if name in names]
-        errors = (self.fit.fit.simulated - evaluator.observed)[..., angle_channels]
-        return bool(np.nanmax(np.abs(errors), initial=0.0) > MAX_ROTATION_ERROR)
-
 
 def filter_and_fit(runs: SimulatedRuns) -> BaseModel:
     """Fit the base model; the runs of a robot are filtered before."""
@@ -246,3 +188,23 @@ def _get_starts(runs: SimulatedRuns) -> Array | None:
         identified = runs.context.identified
         return None if identified is None else identified.base
     return find_start_with_tuner(options.tuner, runs.fitting, runs.noise, options.seed)
+
+
+def make_simulation_error(base: BaseModel, errors: Sequence[RecordingFault]) -> InputError:
+    """Return the error that explains why nothing could be simulated.
+
+    Args:
+        base: Base model whose fit failed.
+        errors: Wrong units and signs of the recording, which may be the reason.
+    """
+    path = base.runs.recording.path
+    if errors:
+        return InputError(f"{path}: {errors[0].says}")
+    if base.runs.context.search_control.is_over():
+        return InputError(
+            f"{path}: the search was stopped before the first fit of the recording was finished"
+        )
+    return DivergingSimulationError(
+        f"{path}: the simulation fails at every starting point of the fit; "
+        "check constants, units, inputs and initial states"
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bench.diagnosis.conventions.unit_check import Subject, find_imitated_unit, find_wrong_units
 from bench.diagnosis.pipeline.base_model import BaseModel
+from bench.diagnosis.pipeline.run_filtering import needs_nonlinear_filter
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns, list_free
 from bench.diagnosis.pipeline.verdict_builder import build_causes
@@ -93,7 +94,7 @@ def refuse_broken_conventions(runs: SimulatedRuns) -> None:
     # The linear model is not valid at these contacts.
     if contacts.is_on_ground:
         return
-    if contacts.has_contacts and contacts.needs_nonlinear_filter(runs.nominal_filter):
+    if contacts.has_contacts and needs_nonlinear_filter(runs):
         return
     subject = _make_subject(runs)
     differences = ConventionComparison(subject).differences()

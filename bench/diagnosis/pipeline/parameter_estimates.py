@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
 
-from bench.diagnosis.dry_friction_form import add_solver_parameters, get_friction_form
 from bench.diagnosis.evaluation.parameter_bounds import bound_of, get_bounds_by_index, is_unusual
 from bench.diagnosis.evaluation.time_scaled_ranges import is_instant
 from bench.diagnosis.fitting.fitted_models import FittedModel
-from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.validation.confidence_intervals import compute_intervals
-from bench.diagnosis.verdict import Cause
 from sims.core.effect import Effect, members_of
 from sims.extended_simulator import FittedValue
-from sims.robot.fitted_causes import GRAVITY_COMPENSATED, is_gravity_compensated
+from sims.robot.fitted_causes import is_gravity_compensated
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,53 +157,3 @@ class ParameterEstimates:
         coefficients = evaluator.available_effects[name].on(evaluator.simulator.system)
         indices = evaluator.get_coefficient_indices(name)
         return {c.name: self.values[i] for c, i in zip(coefficients, indices, strict=True)}
-
-    def build_cause(self, evidence: CauseEvidence) -> Cause:
-        """Build a cause of the verdict from an effect found by the search.
-
-        It has the effect's description and fitted coefficients. The description names the soft form
-        of dry friction (MuJoCo's `frictionloss`) with the solver parameters if the friction has it.
-
-        Args:
-            evidence: the effect and its evidence.
-        """
-        evaluator = self.search.evaluator
-        effect = evaluator.available_effects[evidence.effect]
-        # A coefficient that cannot be observed is fixed at zero and is not a result.
-        coefficients = effect.on(evaluator.simulator.system)
-        fixed = {c.name for c in coefficients if c.least is not None and c.least == c.most}
-        fitted_values = {
-            name: number
-            for name, number in self.select_coefficients(evidence.effect).items()
-            if name not in fixed
-        }
-        friction_form = get_friction_form(evaluator, evidence.effect)
-        description = effect.says
-        if friction_form is not None:
-            description = add_solver_parameters(evaluator, evidence.effect, description)
-        if evaluator.kind.has_model and is_gravity_compensated(evidence.effect, fitted_values):
-            description = GRAVITY_COMPENSATED
-        return Cause(
-            effect=evidence.effect,
-            alternatives=evidence.alternatives,
-            says=description,
-            coefficients=fitted_values,
-            p_value=evidence.p_value,
-            form=friction_form,
-        )
-
-    def are_results(self, effects: Iterable[str]) -> bool:
-        """Return whether the coefficients of effects are results, and no parameter is at a bound.
-
-        A result has a finite interval. A base parameter at a bound of its range counts, because a
-        cause may compensate for a value beyond the bound; one that is a result nevertheless, such
-        as zero at a physical limit, does not.
-
-        Args:
-            effects: names of the effects.
-        """
-        evaluator = self.search.evaluator
-        base_values = [self.values[i] for i in evaluator.base_indices.tolist()]
-        indices = [i for name in effects for i in evaluator.get_coefficient_indices(name)]
-        is_base_at_bound = any(v.at_bound is not None and not v.is_result for v in base_values)
-        return all(self.values[i].is_result for i in indices) and not is_base_at_bound

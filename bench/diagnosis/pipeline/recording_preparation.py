@@ -10,8 +10,10 @@ import numpy as np
 
 from bench.core.resource_estimates import check_recording_size
 from bench.diagnosis.evaluation.noise_floor import INTEGRATION_ERROR_SHARE, add_minimal_noise
-from bench.diagnosis.pipeline.contact_conditions import ContactConditions
-from bench.diagnosis.pipeline.segment_choice import leave_out_unpredictable_segments
+from bench.diagnosis.pipeline.segment_choice import (
+    choose_segment_duration,
+    leave_out_unpredictable_segments,
+)
 from bench.diagnosis.pipeline.simulated_runs import (
     DiagnosisContext,
     SimulatedRuns,
@@ -142,7 +144,7 @@ def _prepare_recording(
     options = context.options
     recording, thinning_note = thin_recording(recording, kind)
     recording, settling_note = leave_out_settling(recording, kind)
-    seconds = ContactConditions(kind).get_segment_duration(options)
+    seconds = choose_segment_duration(kind, options)
     recording, segment_note = segment_recording(recording, kind, seconds, options.whole)
     recorded = recording.runs[0].channels
     names = [channel.name for channel in kind.channels if channel.name in recorded]

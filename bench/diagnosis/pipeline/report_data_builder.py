@@ -8,14 +8,12 @@ import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import select_likeliest
-from bench.diagnosis.identifiability import (
-    assess_identifiability_after_search,
-)
-from bench.diagnosis.pipeline.held_out_gap_closed import HeldOutGains
+from bench.diagnosis.identifiability import assess_identifiability_after_search
+from bench.diagnosis.pipeline.held_out_gap_closed import HeldOutGainCalculator
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 from bench.diagnosis.report import residual_analysis
-from bench.diagnosis.report.cause_and_value_text import END, format_effect_set, format_file_change
+from bench.diagnosis.report.cause_and_value_text import format_file_change
 from bench.diagnosis.report.report_data import (
     ChannelInfo,
     DataSplit,
@@ -23,10 +21,13 @@ from bench.diagnosis.report.report_data import (
     GapLocation,
     ParameterChange,
 )
+from bench.diagnosis.report.summary_text import (
+    list_bound_warnings,
+    list_unexplained_residuals,
+    list_verdict_reasons,
+)
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.effect_search import EffectSearch
-from bench.diagnosis.search.lack_of_fit import LackOfFitResult
-from bench.diagnosis.search.verdict_rules import STRUCTURE_P_VALUE_THRESHOLD
 from bench.diagnosis.validation.run_consistency import (
     ConsistencySummary,
     ParameterConsistency,
@@ -59,15 +60,25 @@ def build_report_data(
     # Before and after: the fitted base model, and the model with the causes.
     before, after = finding.base.fit.simulated, finding.model.fit.simulated
     # The noise is that of the finding, because a good model estimates it better.
-    gains = HeldOutGains(result)
+    gains = HeldOutGainCalculator(result)
     sigma = gains.noise_sigma
     held_out, held_out_locations = _summarise_held_out(result, sigma)
     changes = tuple(_list_parameter_changes(result))
     # With a wrong unit or sign, no cause was searched, and there is nothing to explain.
     unexplained, reasons, consistency = tuple[str, ...](), tuple[str, ...](), ConsistencySummary()
     if not verdict.recording_faults:
-        unexplained = (*_list_unexplained(result), *_warn_of_bounds(changes), *notes)
-        reasons = tuple(_list_verdict_reasons(finding))
+        base = result.base
+        unexplained = (
+            *list_unexplained_residuals(
+                finding.lack_of_fit,
+                evaluator.channels,
+                base.join_names(base.fit.insensitive_parameters),
+                base.join_names(base.fit.unidentified_parameters),
+            ),
+            *list_bound_warnings(changes),
+            *notes,
+        )
+        reasons = tuple(list_verdict_reasons(finding))
         consistency = _assess_consistency(result)
     return DiagnosisReportData(
         # A recording without a title is identified by its file name.
@@ -99,75 +110,19 @@ def build_report_data(
     )
 
 
-def _read_track_figure(recording: Recording) -> bytes:
-    """Return the PNG figure that film tracking saved next to the recording; empty if none.
+def build_data_split(evaluator: RunEvaluator, before: Array, after: Array) -> DataSplit:
+    """Return the runs of a run evaluator with two simulations of them.
 
-    A recording is from a film if it has the columns of the tracked ball. A file that is too large
-    or not a PNG is left out, because any file may have that name.
-    """
-    path = recording.path.with_suffix(".png")
-    if not recording.extra.keys() >= TRACK_COLUMNS:
-        return b""
-    try:
-        with path.open("rb") as file:
-            picture = file.read(MAX_TRACK_FIGURE_BYTES + 1)
-    except OSError:
-        return b""
-    is_usable = picture.startswith(PNG_SIGNATURE) and len(picture) <= MAX_TRACK_FIGURE_BYTES
-    return picture if is_usable else b""
-
-
-def _assess_consistency(result: SearchResult) -> ConsistencySummary:
-    """Assess the consistency of runs, logs and loads for the base and the extended model.
-
-    Consistency means that groups of runs give the same parameters as all runs together.
-    """
-    search, finding = result.search, result.finding
-    # Without a complete search or an identified base model, there is nothing to compare.
-    if finding.early_stop is not None or finding.unidentified_parameters:
-        return ConsistencySummary()
-    before = assess_consistency(search, finding.base)
-    after = assess_consistency(search, finding.model) if finding.model.effects else before
-    return ConsistencySummary(before, after, _estimate_parameters_by_group(search, finding))
-
-
-def _estimate_parameters_by_group(
-    search: EffectSearch, finding: DiagnosisResult
-) -> tuple[ParameterConsistency, ...]:
-    """Return the estimates by run, log or load of the best effect other than a single cause.
-
-    They let the report compare how consistent the cause and its best competitor are: a wrong effect
-    needs another coefficient in each group. The competitor is the likeliest single effect with one
-    coefficient that is not part of the diagnosis. The result is empty without a competitor, or if
-    there is not exactly one cause.
+    Shapes: R runs, T samples, C channels.
 
     Args:
-        search: the search, with its fitted models by their effects.
-        finding: its outcome, with the causes.
+        evaluator: Run evaluator of the runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended model.
     """
-    if len(finding.causes) != 1:
-        return ()
-    (cause,) = finding.causes
-    related_effects = {cause.effect, *cause.alternatives, *finding.model.effects}
-    singles = [m for m in search.models.values() if len(m.effects) == 1]
-    other_models = [
-        model
-        for model in singles
-        if not related_effects & set(model.effects)
-        and np.isfinite(model.penalised_log_likelihood)
-        # A trend of a coefficient is only visible in effects with a single coefficient.
-        and len(search.evaluator.get_coefficient_indices(model.effects[0])) == 1
-    ]
-    if not other_models:
-        return ()
-    best = select_likeliest(*other_models)
-    (name,) = best.effects
-    return tuple(
-        consistency
-        for consistency in assess_consistency(search, best)
-        # Only the coefficient of the effect, and not the base parameters.
-        if consistency.number == name
-    )
+    names = tuple(run_data.name for run_data in evaluator.prepared_runs)
+    times = tuple(run_data.scenario.times for run_data in evaluator.prepared_runs)
+    return DataSplit(names, times, evaluator.observed, before, after)
 
 
 def _summarise_held_out(
@@ -245,105 +200,6 @@ def _list_parameter_changes(result: SearchResult) -> Iterator[ParameterChange]:
         )
 
 
-def _list_unexplained(result: SearchResult) -> Iterator[str]:
-    """Yield sentences on the residual of the extended model, and on parameters kept nominal.
-
-    These are channels above the noise, the dependence of an unmodelled force, and parameters that
-    the data do not identify.
-
-    Args:
-        result: result of the search, with the lack-of-fit test of the extended model.
-    """
-    evaluator, lack_of_fit = result.runs.fitting, result.finding.lack_of_fit
-    for channel in lack_of_fit.channels_above_noise:
-        noise_multiple = lack_of_fit.excess[evaluator.channels.index(channel)]
-        yield f"the residual of channel {channel} is {noise_multiple:.3g} times its noise"
-    # Without a result of the test for unmodelled forces there is no dependence to report.
-    if lack_of_fit.has_structure and lack_of_fit.where:
-        yield f"the residual behaves like a force that depends on {lack_of_fit.where}"
-    base = result.base
-    if names := base.join_names(base.fit.insensitive_parameters):
-        yield f"the data do not depend on {names}: kept at the nominal value"
-    if names := base.join_names(base.fit.unidentified_parameters):
-        yield (
-            f"the data do not identify {names} together with the other parameters: kept at the "
-            "nominal value"
-        )
-
-
-def _warn_of_bounds(changes: Sequence[ParameterChange]) -> Iterator[str]:
-    """Yield a warning for each base parameter whose fitted value is at a bound of its range.
-
-    The value may then be wrong, and a cause may compensate for it. There are two fits, that of the
-    base model and that of the model with the causes. Of a parameter that is at a bound in both,
-    only the base fit is reported.
-
-    Args:
-        changes: value, interval and bound of each parameter in both fits.
-    """
-    for parameter in changes:
-        (value_before, *_), (value_after, *_) = parameter.before, parameter.after
-        values = value_before, value_after
-        for fit_text, value, bound in zip(
-            ("in the base fit ", ""), values, parameter.bounds, strict=True
-        ):
-            if bound is None:
-                continue
-            yield (
-                f"{fit_text}{parameter.name} lies at the {END[bound]} bound of its range, "
-                f"{value:g} {parameter.unit}: larger ranges were not searched, and a "
-                "cause may compensate for a value beyond the bound. Check the "
-                "units and constants of the recording"
-            )
-            # The second fit is not reported in addition.
-            break
-
-
-def _list_verdict_reasons(finding: DiagnosisResult) -> Iterator[str]:
-    """Yield the reasons for the verdict as sentences, the most important first.
-
-    A search that was stopped early has no such reasons.
-
-    Args:
-        finding: outcome of the search: verdict, causes and lack of fit.
-    """
-    if finding.early_stop is not None:
-        return
-    if finding.verdict == "unknown" and finding.causes:
-        yield "the best effects do not close enough of the gap to explain it"
-    if finding.verdict in ("partial", "unknown") and finding.lack_of_fit.has_structure:
-        yield _describe_residual_structure(finding.lack_of_fit)
-    for cause in finding.causes:
-        if cause.alternatives:
-            names = [cause.effect, *cause.alternatives]
-            # Effects of a robot have a place, such as `friction.coulomb@elbow`.
-            have_places = any("@" in name for name in names)
-            effects_text = (
-                format_effect_set(names, "and") if have_places else _join_effect_names(names)
-            )
-            yield (
-                f"{effects_text} have the same influence on these runs, "
-                "once parameters and initial states are fitted with each: "
-                "their likelihoods differ by odds of less than 33 to 1"
-            )
-
-
-def _describe_residual_structure(lack_of_fit: LackOfFitResult) -> str:
-    """Say how the residual of the final model still differs from the noise of the sensors."""
-    p_value = lack_of_fit.p_value
-    # Lack of fit is either a residual with a pattern, or one that is only too large.
-    if p_value < STRUCTURE_P_VALUE_THRESHOLD:
-        return (
-            f"the residual has structure that sensor noise does not explain (p-value {p_value:.2g})"
-        )
-    return "the residual exceeds the stated noise of the sensors"
-
-
-def _join_effect_names(effects: list[str]) -> str:
-    """Join registered names of effects."""
-    return f"{effects[0]} and {', '.join(effects[1:])}"
-
-
 def _get_value_and_interval(number: Estimate) -> tuple[float, float, float]:
     """Return value and interval as used by figures: NaN where the data give no bound."""
     low = np.nan if number.low is None else number.low
@@ -351,16 +207,72 @@ def _get_value_and_interval(number: Estimate) -> tuple[float, float, float]:
     return number.value, low, high
 
 
-def build_data_split(evaluator: RunEvaluator, before: Array, after: Array) -> DataSplit:
-    """Return the runs of a run evaluator with two simulations of them.
+def _assess_consistency(result: SearchResult) -> ConsistencySummary:
+    """Assess the consistency of runs, logs and loads for the base and the extended model.
 
-    Shapes: R runs, T samples, C channels.
+    Consistency means that groups of runs give the same parameters as all runs together.
+    """
+    search, finding = result.search, result.finding
+    # Without a complete search or an identified base model, there is nothing to compare.
+    if finding.early_stop is not None or finding.unidentified_parameters:
+        return ConsistencySummary()
+    before = assess_consistency(search, finding.base)
+    after = assess_consistency(search, finding.model) if finding.model.effects else before
+    return ConsistencySummary(before, after, _estimate_parameters_by_group(search, finding))
+
+
+def _estimate_parameters_by_group(
+    search: EffectSearch, finding: DiagnosisResult
+) -> tuple[ParameterConsistency, ...]:
+    """Return the estimates by run, log or load of the best effect other than a single cause.
+
+    They let the report compare how consistent the cause and its best competitor are: a wrong effect
+    needs another coefficient in each group. The competitor is the likeliest single effect with one
+    coefficient that is not part of the diagnosis. The result is empty without a competitor, or if
+    there is not exactly one cause.
 
     Args:
-        evaluator: Run evaluator of the runs.
-        before: (R, T, C) simulated by the base model.
-        after: (R, T, C) simulated by the extended model.
+        search: the search, with its fitted models by their effects.
+        finding: its outcome, with the causes.
     """
-    names = tuple(run_data.name for run_data in evaluator.prepared_runs)
-    times = tuple(run_data.scenario.times for run_data in evaluator.prepared_runs)
-    return DataSplit(names, times, evaluator.observed, before, after)
+    if len(finding.causes) != 1:
+        return ()
+    (cause,) = finding.causes
+    related_effects = {cause.effect, *cause.alternatives, *finding.model.effects}
+    singles = [m for m in search.models.values() if len(m.effects) == 1]
+    other_models = [
+        model
+        for model in singles
+        if not related_effects & set(model.effects)
+        and np.isfinite(model.penalised_log_likelihood)
+        # A trend of a coefficient is only visible in effects with a single coefficient.
+        and len(search.evaluator.get_coefficient_indices(model.effects[0])) == 1
+    ]
+    if not other_models:
+        return ()
+    best = select_likeliest(*other_models)
+    (name,) = best.effects
+    return tuple(
+        consistency
+        for consistency in assess_consistency(search, best)
+        # Only the coefficient of the effect, and not the base parameters.
+        if consistency.number == name
+    )
+
+
+def _read_track_figure(recording: Recording) -> bytes:
+    """Return the PNG figure that film tracking saved next to the recording; empty if none.
+
+    A recording is from a film if it has the columns of the tracked ball. A file that is too large
+    or not a PNG is left out, because any file may have that name.
+    """
+    path = recording.path.with_suffix(".png")
+    if not recording.extra.keys() >= TRACK_COLUMNS:
+        return b""
+    try:
+        with path.open("rb") as file:
+            picture = file.read(MAX_TRACK_FIGURE_BYTES + 1)
+    except OSError:
+        return b""
+    is_usable = picture.startswith(PNG_SIGNATURE) and len(picture) <= MAX_TRACK_FIGURE_BYTES
+    return picture if is_usable else b""

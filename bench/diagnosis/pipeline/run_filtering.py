@@ -9,6 +9,11 @@ from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
 if TYPE_CHECKING:
     from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 
+MAX_FORCE_SHARE_AT_CONTACTS = 1.0
+"""Maximum missing force of a filter, as a share of the typical force, if the robot has contacts."""
+MAX_JOINTS_OF_NONLINEAR_FILTER = 8
+"""Maximum number of joints of a robot whose states in contact a cubature filter estimates."""
+
 
 def filter_simulated_runs(runs: SimulatedRuns) -> None:
     """Filter the runs of a robot with the present model (Kalman filter and smoother).
@@ -32,7 +37,7 @@ def filter_simulated_runs(runs: SimulatedRuns) -> None:
     context.search_control.begin_stage("computing prediction errors")
     # 1. Model file.
     filtered_runs = runs.nominal_filter
-    is_nonlinear = runs.contacts.needs_nonlinear_filter(filtered_runs)
+    is_nonlinear = needs_nonlinear_filter(runs)
     # Innovations larger than expected mean that the filter does not follow the runs.
     if is_nonlinear or not filtered_runs.has_expected_innovations:
         if runs.contacts.has_contacts:
@@ -55,6 +60,28 @@ def filter_simulated_runs(runs: SimulatedRuns) -> None:
         held_out = FollowedRuns.follow(evaluator, theta, runs.noise, max_linearisations=1)
         if held_out.has_expected_innovations:
             evaluator.follow(held_out)
+
+
+def needs_nonlinear_filter(runs: SimulatedRuns) -> bool:
+    """Return whether a robot is in contact, and its linear model fails there.
+
+    The depth of a contact is smaller than the noise of most encoders, so that a model that is
+    linearised about the readings has wrong contact forces. The filter then needs a missing force
+    that is larger than all typical forces. A robot on the ground is linearised about a simulated
+    motion instead. Another robot with many joints keeps the linear model, with process noise at its
+    contacts: the nonlinear filter, whose time grows with the square of the number of joints, would
+    take hours.
+
+    Args:
+        runs: Runs of a robot. Their filter with the linear model has the missing force (standard
+            deviation of the process noise) and the typical force of each joint.
+    """
+    filtered_runs = runs.nominal_filter
+    force_share = float((filtered_runs.force / filtered_runs.typical).max())
+    has_few_joints = len(filtered_runs.typical) <= MAX_JOINTS_OF_NONLINEAR_FILTER
+    # Negated, so that the NaN of a filter that diverged counts as wrong.
+    is_wrong = not force_share <= MAX_FORCE_SHARE_AT_CONTACTS
+    return runs.contacts.has_contacts_off_ground and has_few_joints and is_wrong
 
 
 def _filter_with_fitted_parameters(runs: SimulatedRuns) -> FollowedRuns:

@@ -74,8 +74,8 @@ class SearchResult:
         is_stopped = self.finding.early_stop is not None
         return bool(self.errors) or is_stopped or self.runs.context.search_control.is_over()
 
-    def list_competing_models(self) -> list[FittedModel]:
-        """Return the fitted models with an alternative in place of one of the causes.
+    def list_models_with_alternatives(self) -> list[FittedModel]:
+        """List the fitted models with an alternative in place of one of the causes.
 
         The alternatives explain the data as well as the cause, and an experiment should distinguish
         them. The strongest cause with fitted alternatives is replaced; the most plausible

@@ -1,16 +1,117 @@
-"""Leave out segments of a robot on the ground whose motion no simulation predicts."""
+"""Choice of the segments of the runs: their duration, and which of them are left out.
+
+Runs are cut into shorter segments, each with its own initial state, where no simulation follows a
+whole run. Of a robot on the ground, segments whose motion no simulation predicts are left out.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from bench.diagnosis.pipeline.simulated_runs import SimulatedRuns
-from sims.core.simulator import Array
+from bench.diagnosis.explain_options import ExplainOptions
+from bench.diagnosis.pipeline.base_model import BaseModel
+from bench.diagnosis.pipeline.simulated_runs import ContactConditions, SimulatedRuns
+from sims.core.simulator import Array, Simulator
+from sims.recording.recorded_poses import ANGLES
 
+CONTACT_SEGMENT_SECONDS = 0.5
+"""Duration in seconds of the segments of a robot on the ground."""
+SEGMENT_DURATIONS = (1.0, 0.5, 0.25)
+"""Durations in seconds of the segments that are tried if no simulation of whole runs succeeds."""
+MAX_RUN_AMPLIFICATION = 1000.0
+"""Maximum factor by which whole runs may amplify an error of their first positions."""
+MAX_SEGMENT_AMPLIFICATION = 100.0
+"""Maximum factor by which segments may amplify an error of their first positions."""
+MIN_UNFOLLOWED_RESIDUAL = 3.0
+"""Minimum RMS residual, in units of the noise, of whole runs that are cut into segments."""
+MAX_ROTATION_ERROR = 0.5
+"""Maximum error in rad of the simulated orientation of a floating body.
+
+Beyond it, the effects of small changes are not linear.
+"""
 MAX_RESIDUAL_RATIO = 1.25
 """Maximum residual (RMS) of a segment without a jump, relative to the median of all segments."""
 MAX_LEFT_OUT_SHARE = 0.25
 """Maximum share of the segments that are left out because of jumps."""
+
+
+def choose_segment_duration(kind: type[Simulator], options: ExplainOptions) -> float | None:
+    """Return the duration in seconds of the segments of each run; None for the usual ones.
+
+    Runs of a robot on the ground are cut unless the user requests otherwise: a linear model about a
+    simulated motion is not valid for long where contacts begin and end.
+
+    Args:
+        kind: Class of the simulator.
+        options: Options of the diagnosis.
+    """
+    is_on_ground = ContactConditions(kind).is_on_ground
+    if options.pieces is not None or options.whole or not is_on_ground:
+        return options.pieces
+    return CONTACT_SEGMENT_SECONDS
+
+
+def is_divisible(runs: SimulatedRuns) -> bool:
+    """Return whether runs may be cut into segments: those of a robot with a recorded pose.
+
+    Those of a robot on the ground are short already.
+
+    Args:
+        runs: Prepared runs.
+    """
+    kind: Any = runs.kind
+    has_unknown_states = kind.has_model and bool(kind.system.required_state_units)
+    return kind.has_model and not has_unknown_states and not runs.contacts.is_on_ground
+
+
+def find_segment_duration(model: BaseModel) -> float | None:
+    """Return the duration in seconds of segments that a simulation can follow.
+
+    An unstable or chaotic motion amplifies the error of an estimated first state, until no
+    simulation follows it. Shorter segments begin at new first states.
+
+    Args:
+        model: Base model, fitted to whole runs.
+
+    Returns:
+        The longest of `SEGMENT_DURATIONS` with a small amplification, or the shortest if none
+        has one. None if whole runs can be used: the base model simulates them well, they
+        amplify errors little, or no filter can tell.
+    """
+    followed = model.runs.fitting.filtered_runs
+    if followed is None or not model.is_usable:
+        return None
+    _, residual_rms = model.rate()
+    is_simulated = residual_rms < MIN_UNFOLLOWED_RESIDUAL
+    if is_simulated or not followed.compute_amplification() > MAX_RUN_AMPLIFICATION:
+        return None
+    for seconds in SEGMENT_DURATIONS:
+        if followed.compute_amplification(seconds) <= MAX_SEGMENT_AMPLIFICATION:
+            return seconds
+    return SEGMENT_DURATIONS[-1]
+
+
+def loses_orientation(model: BaseModel) -> bool:
+    """Return whether a simulated floating body is far from its recorded orientation.
+
+    Beyond a certain error a fit does not find back; the runs are then divided into shorter
+    segments.
+
+    Args:
+        model: Fitted base model of a robot.
+    """
+    # Channels of the orientation, such as `q.base.yaw`.
+    names = [
+        f"q.{base_name}.{angle}"
+        for base_name in model.runs.kind.system.base_orientations
+        for angle in ANGLES
+    ]
+    evaluator = model.runs.fitting
+    angle_channels = [c for c, name in enumerate(evaluator.channels) if name in names]
+    errors = (model.fit.fit.simulated - evaluator.observed)[..., angle_channels]
+    return bool(np.nanmax(np.abs(errors), initial=0.0) > MAX_ROTATION_ERROR)
 
 
 def leave_out_unpredictable_segments(runs: SimulatedRuns) -> SimulatedRuns:

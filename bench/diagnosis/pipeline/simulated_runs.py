@@ -19,12 +19,11 @@ from bench.diagnosis.evaluation.parameter_bounds import Bounds, use_bounds
 from bench.diagnosis.evaluation.run_evaluator import IdentifiedParameters, RunEvaluator
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.fitting.base_fit import BaseFit
-from bench.diagnosis.pipeline.contact_conditions import ContactConditions
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.lack_of_fit import list_hat_effects
 from bench.diagnosis.validation.cross_validation import CrossValidation
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns, Validation
-from sims.core.simulator import Array
+from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
 
@@ -93,6 +92,40 @@ class DiagnosisContext:
     def close(self) -> None:
         """Close all simulators; proposals of experiments need them until then."""
         self._simulators.close()
+
+
+@dataclass(frozen=True)
+class ContactConditions:
+    """Conditions that depend on whether a simulated robot touches something.
+
+    A robot on the ground has a recorded pose and stands or drives. Other robots may touch something
+    with a gripper or a foot.
+
+    Attributes:
+        kind: class of the simulator, which need not be a robot.
+    """
+
+    kind: type[Simulator]
+
+    @property
+    def is_on_ground(self) -> bool:
+        """Return whether the recorded pose is that of a robot that stands or drives."""
+        return self.kind.has_model and bool(self._robot.is_on_ground)
+
+    @property
+    def has_contacts(self) -> bool:
+        """Return whether geoms of a robot touch in the recording."""
+        return self.kind.has_model and bool(self._robot.contacts)
+
+    @property
+    def has_contacts_off_ground(self) -> bool:
+        """Return whether a robot touches something but does not stand on the ground."""
+        return self.has_contacts and not self.is_on_ground
+
+    @property
+    def _robot(self) -> Any:
+        kind: Any = self.kind
+        return kind.robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +231,7 @@ class SimulatedRuns:
 
     @property
     def contacts(self) -> ContactConditions:
-        """Conditions that depend on contacts of a robot."""
+        """Contacts of a robot with the ground and with itself or other objects."""
         return ContactConditions(self.kind)
 
     @cached_property

@@ -1,10 +1,12 @@
-"""Choice of MuJoCo's solver options for a robot with contacts: those of the file or others.
-
-Alternative options of MuJoCo's solver, ranked by how well they explain the recording.
+"""Choice of MuJoCo's solver options for a robot with contacts: those of the model file or others.
 
 Two simulators of one model file can differ in options that change the motion where geoms touch: the
 friction cone, the ratio of the friction's impedance to that of the normal force (`impratio`), the
 iterations that prevent slip, the constraint solver and its iterations, and the integrator.
+
+The options are changed one after the other. In each round, alternatives are ranked by a simulation
+of the runs with the present fit (`rank_option_alternatives`), and the base model is fitted with the
+best few (`RatedOptions`).
 """
 
 from __future__ import annotations
@@ -43,6 +45,27 @@ MAX_OPTION_ROUNDS = 3
 """Maximum number of options of the solver that are changed."""
 MAX_FITTED_OPTIONS = 3
 """Maximum number of alternative options that are fitted in a round."""
+IMPEDANCE_RATIOS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+"""Values of `impratio` that are tried; model files state numbers between 1 and 100."""
+NOSLIP_ITERATIONS = (0, 5)
+"""Numbers of iterations without slip that are tried: without, and with as many as usual."""
+SOLVER_ITERATIONS = (1, 3, 10, 30, 100)
+"""Numbers of iterations of the solver that are tried."""
+MIN_DISTINCT_CHANGE = 0.05
+"""Minimum RMS difference of two alternatives, in units of the noise, of which both are tried."""
+MIN_SQUARES_DECREASE = 20.0
+"""Minimum decrease of the sum of squares by an alternative, in units of the noise."""
+MAX_EXCESS_RATIO = 0.4
+"""Maximum excess of the sum of squares over that of noise by another option, relative to without.
+
+The initial states belong to the options in use. An option is accepted only if it leaves at most a
+quarter of this excess with initial states of its own.
+"""
+MIN_CLEAR_MEAN_SQUARE = 9.0
+"""Minimum mean square of the residual, in units of the noise, for `MAX_EXCESS_RATIO` to apply.
+
+Nearer to the noise, the residual also depends on the initial states.
+"""
 
 
 class RatedOptions(NamedTuple):
@@ -228,68 +251,6 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
     return rated
 
 
-def _has_competing_effect(options: RatedOptions, file_options: RatedOptions) -> bool:
-    """Return whether an effect may explain the recording as other options of the solver do.
-
-    1. Scan the coefficients of effects at contacts by simulation. Far from the noise, linear scores
-       are not valid, so that these effects alone decide, by the sum of squares.
-    2. Score all other effects to first order, except laws with many shapes: an option is the
-       simpler explanation.
-    3. Compare the gain in twice the log-likelihood of the best effect with that of the options.
-
-    Args:
-        options: the other solver options, with the base model fitted to them.
-        file_options: options of the model file, with the base model fitted to them.
-    """
-    # This import is needed for robots only.
-    from bench.diagnosis.search.contact_search import (
-        exclude_laws_with_many_shapes,
-        find_lowest_scan,
-    )
-
-    runs = file_options.model.runs
-    search = runs.create_search(file_options.model.fit)
-    # 1. Effects at contacts. A scan simulates an effect with several coefficients.
-    lowest_squares = find_lowest_scan(search)
-    if file_options.residual > MAX_LINEAR_RESIDUAL:
-        return lowest_squares < MAX_COMPETING_SQUARES_RATIO * options.model.fit.fit.cost
-    # 2. Other effects.
-    exclude_laws_with_many_shapes(search)
-    model = search.base_model
-    # Scores are gains in twice the log-likelihood.
-    score = float(search.score_missing_effects(model).score.max(initial=0.0))
-    # 3. Gains.
-    squares = np.square(search.compute_residual(model.fit) / runs.noise.sigma).sum()
-    sample_count = float(search.observed_mask.sum())
-    # Twice the log-likelihood of white noise is -n log(sum of squares), up to a constant.
-    scan_gain = sample_count * float(np.log(squares / lowest_squares))
-    option_gain = options.log_likelihood - file_options.log_likelihood
-    return max(scan_gain, score) > MIN_COMPETING_GAIN_SHARE * option_gain
-
-
-IMPEDANCE_RATIOS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-"""Values of `impratio` that are tried; model files state numbers between 1 and 100."""
-NOSLIP_ITERATIONS = (0, 5)
-"""Numbers of iterations without slip that are tried: without, and with as many as usual."""
-SOLVER_ITERATIONS = (1, 3, 10, 30, 100)
-"""Numbers of iterations of the solver that are tried."""
-MIN_DISTINCT_CHANGE = 0.05
-"""Minimum RMS difference of two alternatives, in units of the noise, of which both are tried."""
-MIN_SQUARES_DECREASE = 20.0
-"""Minimum decrease of the sum of squares by an alternative, in units of the noise."""
-MAX_EXCESS_RATIO = 0.4
-"""Maximum excess of the sum of squares over that of noise by another option, relative to without.
-
-The initial states belong to the options in use. An option is accepted only if it leaves at most a
-quarter of this excess with initial states of its own.
-"""
-MIN_CLEAR_MEAN_SQUARE = 9.0
-"""Minimum mean square of the residual, in units of the noise, at which that ratio counts.
-
-Nearer to the noise, the residual also depends on the initial states.
-"""
-
-
 class OptionAlternative(NamedTuple):
     """Settings with other options than those in use.
 
@@ -404,3 +365,42 @@ def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSett
             changed = {name: number for name, number in pair.items() if number != present[name]}
             if changed:
                 yield settings.replace_options(changed)
+
+
+def _has_competing_effect(options: RatedOptions, file_options: RatedOptions) -> bool:
+    """Return whether an effect may explain the recording as other options of the solver do.
+
+    1. Scan the coefficients of effects at contacts by simulation. Far from the noise, linear scores
+       are not valid, so that these effects alone decide, by the sum of squares.
+    2. Score all other effects to first order, except laws with many shapes: an option is the
+       simpler explanation.
+    3. Compare the gain in twice the log-likelihood of the best effect with that of the options.
+
+    Args:
+        options: the other solver options, with the base model fitted to them.
+        file_options: options of the model file, with the base model fitted to them.
+    """
+    # This import is needed for robots only.
+    from bench.diagnosis.search.contact_search import (
+        exclude_laws_with_many_shapes,
+        find_lowest_scan,
+    )
+
+    runs = file_options.model.runs
+    search = runs.create_search(file_options.model.fit)
+    # 1. Effects at contacts. A scan simulates an effect with several coefficients.
+    lowest_squares = find_lowest_scan(search)
+    if file_options.residual > MAX_LINEAR_RESIDUAL:
+        return lowest_squares < MAX_COMPETING_SQUARES_RATIO * options.model.fit.fit.cost
+    # 2. Other effects.
+    exclude_laws_with_many_shapes(search)
+    model = search.base_model
+    # Scores are gains in twice the log-likelihood.
+    score = float(search.score_missing_effects(model).score.max(initial=0.0))
+    # 3. Gains.
+    squares = np.square(search.compute_residual(model.fit) / runs.noise.sigma).sum()
+    sample_count = float(search.observed_mask.sum())
+    # Twice the log-likelihood of white noise is -n log(sum of squares), up to a constant.
+    scan_gain = sample_count * float(np.log(squares / lowest_squares))
+    option_gain = options.log_likelihood - file_options.log_likelihood
+    return max(scan_gain, score) > MIN_COMPETING_GAIN_SHARE * option_gain

@@ -79,7 +79,7 @@ class TimeStepChoice:
         runs = model.runs
         file_log_likelihood, residual_rms = model.rate()
         file_excess = residual_rms - 1.0
-        shows_errors = model.shows_step_errors()
+        shows_errors = _shows_step_errors(model)
         if not shows_errors and not file_excess > MIN_TESTED_EXCESS:
             return model
         # A refinement is a finer step with its simulated error. The generator simulates each when
@@ -187,6 +187,27 @@ class TimeStepChoice:
             return finer
         self.finding, self._file_runs = CoarseStepFinding(refinement, gain), file.runs
         return replace(finer, runs=replace(finer.runs, before=file.predict_held_out()))
+
+
+def _shows_step_errors(model: BaseModel) -> bool:
+    """Return whether the recording shows the discretisation error of the engine's steps.
+
+    The innovations of a Kalman filter show it. Without a filter of the runs this is not known,
+    and true is returned.
+
+    Args:
+        model: base model, fitted with the file's own step.
+    """
+    runs = model.runs
+    if runs.fitting.filtered_runs is None or not model.is_usable:
+        return True
+    # These imports are needed for robots only.
+    from bench.diagnosis.kalman.linearised_filter import FollowedRuns
+    from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
+
+    # The filter with the fitted parameters, which may be the stored one.
+    theta = model.fit.fit.theta
+    return shows_step_errors(FollowedRuns.get_or_follow(runs.fitting, theta, runs.noise))
 
 
 def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float, float]:

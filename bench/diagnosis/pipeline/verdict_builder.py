@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
+from bench.diagnosis.dry_friction_form import add_solver_parameters, get_friction_form
 from bench.diagnosis.experiment_design.discriminating_run import (
     DiscriminatingRun,
     propose_discriminating_run,
 )
-from bench.diagnosis.pipeline.held_out_gap_closed import HeldOutGains
+from bench.diagnosis.pipeline.held_out_gap_closed import (
+    HeldOutGainCalculator,
+    compute_held_out_excess,
+)
+from bench.diagnosis.pipeline.parameter_estimates import ParameterEstimates
 from bench.diagnosis.pipeline.search_result import SearchResult
 from bench.diagnosis.search import verdict_rules
+from bench.diagnosis.search.alternative_causes import CauseEvidence
 from bench.diagnosis.search.diagnose import DiagnosisResult
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.score_test import estimate_tail_p_value
 from bench.diagnosis.verdict import Candidate, Cause, Verdict
-from sims.core.root_mean_square import compute_rms
+from sims.robot.fitted_causes import GRAVITY_COMPENSATED, is_gravity_compensated
 
 
 def build_verdict(result: SearchResult) -> Verdict:
@@ -33,7 +40,7 @@ def build_verdict(result: SearchResult) -> Verdict:
     runs, evaluator, finding = result.runs, result.runs.fitting, result.finding
     numbers = result.estimates.values
     causes = build_causes(result)
-    gains = HeldOutGains(result)
+    gains = HeldOutGainCalculator(result)
     parameters = {evaluator.parameters[i].name: numbers[i] for i in evaluator.base_indices.tolist()}
     # Simulations for the proposal of an experiment are not part of the answer.
     simulations = evaluator.simulation_count
@@ -65,7 +72,43 @@ def build_causes(result: SearchResult) -> tuple[Cause, ...]:
     Returns:
         One `Cause` of the verdict for each cause found, in the same order.
     """
-    return tuple(result.estimates.build_cause(cause) for cause in result.finding.causes)
+    return tuple(_build_cause(result.estimates, cause) for cause in result.finding.causes)
+
+
+def _build_cause(estimates: ParameterEstimates, evidence: CauseEvidence) -> Cause:
+    """Build a cause of the verdict from an effect found by the search.
+
+    It has the effect's description and fitted coefficients. The description names the soft form
+    of dry friction (MuJoCo's `frictionloss`) with the solver parameters if the friction has it.
+
+    Args:
+        estimates: estimates of the found model.
+        evidence: the effect and its evidence.
+    """
+    evaluator = estimates.search.evaluator
+    effect = evaluator.available_effects[evidence.effect]
+    # A coefficient that cannot be observed is fixed at zero and is not a result.
+    coefficients = effect.on(evaluator.simulator.system)
+    fixed = {c.name for c in coefficients if c.least is not None and c.least == c.most}
+    fitted_values = {
+        name: number
+        for name, number in estimates.select_coefficients(evidence.effect).items()
+        if name not in fixed
+    }
+    friction_form = get_friction_form(evaluator, evidence.effect)
+    description = effect.says
+    if friction_form is not None:
+        description = add_solver_parameters(evaluator, evidence.effect, description)
+    if evaluator.kind.has_model and is_gravity_compensated(evidence.effect, fitted_values):
+        description = GRAVITY_COMPENSATED
+    return Cause(
+        effect=evidence.effect,
+        alternatives=evidence.alternatives,
+        says=description,
+        coefficients=fitted_values,
+        p_value=evidence.p_value,
+        form=friction_form,
+    )
 
 
 def restrict_verdict(result: SearchResult) -> DiagnosisResult:
@@ -79,8 +122,26 @@ def restrict_verdict(result: SearchResult) -> DiagnosisResult:
     if finding.verdict == "unknown" and _is_refuted(result):
         return replace(finding, verdict="adequate")
     unambiguous_causes = [cause.effect for cause in finding.causes if not cause.alternatives]
-    are_results = result.estimates.are_results(unambiguous_causes)
+    are_results = _are_results(result.estimates, unambiguous_causes)
     return replace(finding, verdict=verdict_rules.verdict_of_numbers(finding.verdict, are_results))
+
+
+def _are_results(estimates: ParameterEstimates, effects: Iterable[str]) -> bool:
+    """Return whether the coefficients of effects are results, and no parameter is at a bound.
+
+    A result has a finite interval. A base parameter at a bound of its range counts, because a
+    cause may compensate for a value beyond the bound; one that is a result nevertheless, such
+    as zero at a physical limit, does not.
+
+    Args:
+        estimates: estimates of the found model.
+        effects: names of the effects.
+    """
+    evaluator = estimates.search.evaluator
+    base_values = [estimates.values[i] for i in evaluator.base_indices.tolist()]
+    indices = [i for name in effects for i in evaluator.get_coefficient_indices(name)]
+    is_base_at_bound = any(v.at_bound is not None and not v.is_result for v in base_values)
+    return all(estimates.values[i].is_result for i in indices) and not is_base_at_bound
 
 
 def _is_refuted(result: SearchResult) -> bool:
@@ -107,7 +168,7 @@ def _is_refuted(result: SearchResult) -> bool:
         for model in extended_models
         if model.penalised_log_likelihood > search.base_model.penalised_log_likelihood
     ]
-    excess = _compute_held_out_excess(result)
+    excess = compute_held_out_excess(result)
     # The base model alone must leave no large gap on held-out runs. Without effects, the excess is
     # the same before and after.
     has_held_out_gap = excess is not None and verdict_rules.misses_held_out_gap(excess, excess)
@@ -123,7 +184,7 @@ def _is_refuted(result: SearchResult) -> bool:
     )
 
 
-def _list_candidates(search: EffectSearch, gains: HeldOutGains) -> tuple[Candidate, ...]:
+def _list_candidates(search: EffectSearch, gains: HeldOutGainCalculator) -> tuple[Candidate, ...]:
     """List all effects of the library with their scores about the base model, best first.
 
     The score is twice the gain in log-likelihood, by the linear score test or by a fit if that
@@ -169,21 +230,11 @@ def _propose_next_run(result: SearchResult) -> DiscriminatingRun | None:
         return None
     if finding.verdict == "unidentifiable":
         return _propose_identifying_run(finding.unidentified_parameters)
-    competing_models = result.list_competing_models()
+    competing_models = result.list_models_with_alternatives()
     if not competing_models:
         return None
     most_plausible, *_ = competing_models
     return propose_discriminating_run(search, finding.model, most_plausible)
-
-
-def _compute_held_out_excess(result: SearchResult) -> float | None:
-    """Return the excess RMS residual of the base model on held-out runs; None without them."""
-    runs, held_out_fits = result.runs.predicted, result.finding.held_out_fits
-    if runs is None or held_out_fits is None or () not in held_out_fits:
-        return None
-    sigma = result.runs.floor.sigma
-    normalised_residual = (runs.observed - held_out_fits[()].simulated) / sigma
-    return compute_rms(normalised_residual[np.isfinite(runs.observed)]) - 1.0
 
 
 def _propose_identifying_run(unidentified: tuple[str, ...]) -> DiscriminatingRun:

@@ -41,13 +41,10 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     remove_idle_effects,
     select_lowest_of_each,
 )
-from bench.diagnosis.prediction_error.single_effect_fits import (
-    refine_at_force_limits,
-    scale_effect,
-)
+from bench.diagnosis.prediction_error.single_effect_fits import refine_at_force_limits
 from bench.diagnosis.prediction_error.stepwise_selection_by_filters import try_one_more_effect
 from bench.diagnosis.search.alternative_causes import differ_in_one_effect
-from bench.diagnosis.search.fit_starts import make_replacing_start
+from bench.diagnosis.search.fit_starts import make_replacing_start, scale_effect
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.simulator import Array
 
@@ -435,7 +432,7 @@ def _confirm_by_simulation(
     # The second round is between the neighbours of the best factor of the first one.
     for _ in range(2):
         starts = [
-            scale_effect(context, unscaled, name, factor)
+            scale_effect(context.evaluator, unscaled, name, factor)
             for unscaled in same_effect_starts
             for factor in factors.tolist()
         ]

@@ -1,7 +1,10 @@
-"""Fit the dry friction of a selection before other effects, and test whether it has a soft form.
+"""Fit dry friction before other effects, and test whether it has MuJoCo's soft form.
 
-The force of dry friction is not linear in its limit where a joint sticks or creeps. Filters compare
-whether it has MuJoCo's soft form.
+The force of dry friction is not linear in its limit where a joint sticks or creeps, so a selection
+by regression gives poor starts for a fit of all effects at once. MuJoCo simulates dry friction with
+a compliant constraint ("soft form"), so that joints creep; the other form ("stiff") lets them
+stick. Filters find soft friction, and refits by simulation decide between the forms.
+`SoftFrictionError` ends a search in the stiff form.
 """
 
 from __future__ import annotations
@@ -15,15 +18,17 @@ from bench.diagnosis.dry_friction_form import (
     make_soft_kind,
     replace_by_stateless_friction,
 )
+from bench.diagnosis.evaluation.parameter_bounds import clip_coefficients
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import compute_start_costs
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.effect_proposals import MIN_GAIN_SHARE, SearchContext
 from bench.diagnosis.prediction_error.effects_at_joints import get_joint_name
 from bench.diagnosis.prediction_error.filters_with_effects import (
+    ModelFilters,
     compute_comparison_margin,
-    make_soft_friction_models,
 )
 from bench.diagnosis.prediction_error.regression_selection import Selected
 from bench.diagnosis.prediction_error.simulated_fits import (
@@ -35,12 +40,13 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     remove_idle_effects,
 )
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+from sims.core.simulator import Array
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
 FIRST_ITERATIONS = 5
 """Maximum number of steps of the first fit of dry friction."""
-
-
+SOFT_FACTORS = (0.5, 0.8, 1.2, 1.8)
+"""Friction forces tried for dry friction in the soft form, as multiples of the missing force."""
 MIN_LEAD = 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 """Minimum lead in log-likelihood of soft dry friction over another model, both by filters."""
 MIN_LEAD_SHARE = 0.1
@@ -66,9 +72,8 @@ class SoftFrictionError(Exception):
 def compare_friction_forms(context: SearchContext, selected: Selected) -> FittedModel | None:
     """Return stiff dry friction if it explains the runs, or raise an error if soft friction does.
 
-    MuJoCo simulates dry friction with a compliant constraint ("soft form"), so that joints creep;
-    the other form ("stiff") lets them stick. The form decides about the simulator of the whole
-    search, so it is tested before anything but dry friction is fitted:
+    The form decides about the simulator of the whole search, so it is tested before anything but
+    dry friction is fitted:
 
     1. Simulate the stiff friction of the selection. If it explains the runs, it is the result.
     2. Find soft friction by filters. It is not considered if another effect at its joint promises
@@ -201,9 +206,83 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
         return None
     best_group = groups[friction_indices[0]]
     (coefficient,) = columns.solve_alone(regression, best_group)
-    return context.filters.find_soft_friction(
-        best_group.effect, float(np.copysign(1.0, coefficient))
-    )
+    sign = float(np.copysign(1.0, coefficient))
+    known = context.filters.soft_friction
+    if (best_group.effect, sign) not in known:
+        known[best_group.effect, sign] = _search_soft_friction(
+            context.filters, best_group.effect, sign
+        )
+    return known[best_group.effect, sign]
+
+
+def _search_soft_friction(filters: ModelFilters, name: str, sign: float) -> FitStart | None:
+    """Return the likeliest model of soft dry friction at a joint, by filters.
+
+    The models have a few friction forces in ascending order. The likelihood has one maximum over
+    the force. Beginning at the middle, the search goes in the direction in which the log-likelihood
+    of the filter increases, and stops where it decreases.
+
+    Args:
+        filters: the filters of the search.
+        name: name of a friction effect at a joint.
+        sign: 1 for more friction than in the model file, -1 for less.
+
+    Returns:
+        Start of a fit with the likeliest force; None if friction is already soft.
+    """
+    base, joint_name = filters.base, name.partition("@")[2]
+    joint_indices = {get_joint_name(filters.evaluator, j): j for j in range(base.force.size)}
+    thetas = make_soft_friction_models(base, filters.reference, joint_indices[joint_name], sign)
+    if not thetas:
+        return None
+    followed: dict[int, FollowedRuns] = {}
+
+    def log_likelihood(number: int) -> float:
+        """Return the log-likelihood of a model; its filter is made when it is needed."""
+        if number not in followed:
+            # Jacobians depend little on the force.
+            similar = next(iter(followed.values()), None)
+            followed[number] = filters.follow_with_soft_friction(thetas[number], similar)
+        return followed[number].log_likelihood
+
+    middle = len(thetas) // 2
+    step = 1 if log_likelihood(middle) > log_likelihood(middle - 1) else -1
+    best = middle if step > 0 else middle - 1
+    while 0 <= best + step < len(thetas) and log_likelihood(best + step) > log_likelihood(best):
+        best += step
+    return FitStart((name,), thetas[best], filters.estimate_first_states(base))
+
+
+def make_soft_friction_models(
+    followed: FollowedRuns, theta: Array, joint: int, sign: float = 1.0
+) -> list[Array]:
+    """Return models with dry friction of several sizes at a joint, for a search of the best size.
+
+    They are for a simulator with MuJoCo's soft form. The sizes are multiples of the force that the
+    filter misses at the joint. The list is empty if the library has no such effect, or if friction
+    is already soft.
+
+    Args:
+        followed: the runs, without the effect.
+        theta: (P,) parameters without the effect.
+        joint: index of the joint.
+        sign: 1 for more friction than in the model file, -1 for less.
+
+    Returns:
+        The parameters (P,) of each model, in ascending order of the size.
+    """
+    evaluator = followed.evaluator
+    name = f"friction.coulomb@{get_joint_name(evaluator, joint)}"
+    if has_soft_form(evaluator) or name not in evaluator.library:
+        return []
+    models = []
+    for factor in SOFT_FACTORS:
+        # The missing force of a sliding joint is about the force of its friction.
+        size = np.array([sign * factor * float(followed.force[joint])])
+        changed = theta.copy()
+        changed[evaluator.coefficient_slices[name]] = clip_coefficients(evaluator, name, size)
+        models.append(changed)
+    return models
 
 
 def _is_far_less_likely(context: SearchContext, selected: Selected, log_likelihood: float) -> bool:
@@ -229,8 +308,7 @@ def _is_far_less_likely(context: SearchContext, selected: Selected, log_likeliho
 def check_filter(context: SearchContext, log_likelihood: float) -> None:
     """Raise `SoftFrictionError` if soft dry friction of one joint is likelier than a model.
 
-    Both are compared by the log-likelihoods of their filters. Soft friction is a compliant
-    constraint of MuJoCo, with which joints creep instead of sticking.
+    Both are compared by the log-likelihoods of their filters.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -305,6 +383,95 @@ def _compute_margin(context: SearchContext, model: FittedModel) -> float:
         return margin
     gain = model.likelihood.value - context.search.base_model.likelihood.value
     return max(margin, MIN_LEAD_SHARE * gain)
+
+
+def refit_if_likelier_soft(
+    models: ModelSet, model: FittedModel, margin: float
+) -> FittedModel | None:
+    """Refit a robot model in MuJoCo's soft form of dry friction, and return it if it is likelier.
+
+    The dry friction may be an effect or a free number. A model without dry friction, or with soft
+    friction already, is not refitted.
+
+    Args:
+        models: models with stiff friction, with their noise and frozen parameters.
+        model: one of these models, fitted.
+        margin: minimum gain in twice the log-likelihood.
+
+    Returns:
+        The model with soft friction; None if stiff friction is kept.
+    """
+    if not has_dry_friction(models.evaluator, model.effects) or has_soft_form(models.evaluator):
+        return None
+    soft_evaluator = models.evaluator.with_kind(make_soft_kind(models.evaluator.kind))
+    try:
+        return choose_friction_form(models, model, soft_evaluator, margin)
+    finally:
+        soft_evaluator.close()
+
+
+def choose_friction_form(
+    models: ModelSet, model: FittedModel, other_evaluator: RunEvaluator, margin: float
+) -> FittedModel | None:
+    """Refit a model with the other form of dry friction, and return it if it is likelier.
+
+    The forms are stiff and soft: how hard the constraint of MuJoCo's `frictionloss` is solved.
+    Effects with a state that contain dry friction, such as hysteresis, do not act through
+    `frictionloss`. They are replaced by the dry friction that they contain, because they may only
+    imitate the other form.
+
+    Args:
+        models: models of the present form, with their noise and frozen parameters.
+        model: one of these models, for which `has_dry_friction` is true.
+        other_evaluator: run evaluator of the same runs and parameters, with a simulator of the
+            other form.
+        margin: minimum gain in twice the log-likelihood. The sum of squares must be lower, too.
+
+    Returns:
+        The model in the other form; None if the present form is kept.
+    """
+    refitted_model = _refit_with_other_form(other_evaluator, models, model)
+    gain = refitted_model.likelihood.value - model.likelihood.value
+    # Of two models that leave much more than noise, the likelihood with autocorrelated noise may
+    # prefer the one with the larger residual, because it is smoother.
+    is_residual_smaller = refitted_model.fit.cost < model.fit.cost
+    return refitted_model if gain >= margin and is_residual_smaller else None
+
+
+def _refit_with_other_form(
+    evaluator: RunEvaluator, models: ModelSet, model: FittedModel
+) -> FittedModel:
+    """Fit the effects of a model with the other form of dry friction, stiff or soft.
+
+    Both forms can then be compared by their likelihoods. If the discretisation error of the
+    integrator was corrected for the model, it is corrected for the refit, too.
+
+    Args:
+        evaluator: the same runs, with a simulator of the other form.
+        models: models of the present form.
+        model: fitted model of these.
+    """
+    names, theta = replace_by_stateless_friction(models.evaluator, model.effects, model.fit.theta)
+    # The random numbers of these models do not affect the result.
+    other_models = ModelSet(
+        evaluator,
+        models.noise,
+        models.fixed_parameters,
+        make_rng("friction form"),
+        models.is_noise_stated,
+    )
+    refitted_model = other_models.fit_one(FitStart(names, theta, model.fit.initial_states))
+    if models.evaluator.discretisation_correction is None:
+        return refitted_model
+    # Both forms are compared without the discretisation error of the integrator.
+    from bench.diagnosis.evaluation.discretisation_error import correct_discretisation
+
+    correct_discretisation(
+        evaluator, models.noise, refitted_model.fit.theta, refitted_model.fit.initial_states
+    )
+    # Otherwise the fit without the correction, which is known, might be returned again.
+    other_models.models.clear()
+    return other_models.fit_one(refitted_model.fit.make_start())
 
 
 def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
@@ -401,92 +568,3 @@ def is_friction_sufficient(
     if soft_log_likelihood > max(stiff_log_likelihood, selected_log_likelihood) + margin:
         check_fit(context, friction)
     return True
-
-
-def refit_if_likelier_soft(
-    models: ModelSet, model: FittedModel, margin: float
-) -> FittedModel | None:
-    """Refit a robot model in MuJoCo's soft form of dry friction, and return it if it is likelier.
-
-    The dry friction may be an effect or a free number. A model without dry friction, or with soft
-    friction already, is not refitted.
-
-    Args:
-        models: Models with stiff friction, with their noise and frozen parameters.
-        model: One of these models, fitted.
-        margin: Minimum gain in twice the log-likelihood.
-
-    Returns:
-        The model with soft friction; None if stiff friction is kept.
-    """
-    if not has_dry_friction(models.evaluator, model.effects) or has_soft_form(models.evaluator):
-        return None
-    soft_evaluator = models.evaluator.with_kind(make_soft_kind(models.evaluator.kind))
-    try:
-        return choose_friction_form(models, model, soft_evaluator, margin)
-    finally:
-        soft_evaluator.close()
-
-
-def choose_friction_form(
-    models: ModelSet, model: FittedModel, other_evaluator: RunEvaluator, margin: float
-) -> FittedModel | None:
-    """Refit a model with the other form of dry friction, and return it if it is likelier.
-
-    The forms are stiff and soft: how hard the constraint of MuJoCo's `frictionloss` is solved.
-    Effects with a state that contain dry friction, such as hysteresis, do not act through
-    `frictionloss`. They are replaced by the dry friction that they contain, because they may only
-    imitate the other form.
-
-    Args:
-        models: Models of the present form, with their noise and frozen parameters.
-        model: One of these models, for which `has_dry_friction` is true.
-        other_evaluator: Run evaluator of the same runs and parameters, with a simulator of the
-            other form.
-        margin: Minimum gain in twice the log-likelihood. The sum of squares must be lower, too.
-
-    Returns:
-        The model in the other form; None if the present form is kept.
-    """
-    refitted_model = _refit_with_other_form(other_evaluator, models, model)
-    gain = refitted_model.likelihood.value - model.likelihood.value
-    # Of two models that leave much more than noise, the likelihood with autocorrelated noise may
-    # prefer the one with the larger residual, because it is smoother.
-    is_residual_smaller = refitted_model.fit.cost < model.fit.cost
-    return refitted_model if gain >= margin and is_residual_smaller else None
-
-
-def _refit_with_other_form(
-    evaluator: RunEvaluator, models: ModelSet, model: FittedModel
-) -> FittedModel:
-    """Fit the effects of a model with the other form of dry friction, stiff or soft.
-
-    Both forms can then be compared by their likelihoods. If the discretisation error of the
-    integrator was corrected for the model, it is corrected for the refit, too.
-
-    Args:
-        evaluator: the same runs, with a simulator of the other form.
-        models: models of the present form.
-        model: fitted model of these.
-    """
-    names, theta = replace_by_stateless_friction(models.evaluator, model.effects, model.fit.theta)
-    # The random numbers of these models do not affect the result.
-    other_models = ModelSet(
-        evaluator,
-        models.noise,
-        models.fixed_parameters,
-        make_rng("friction form"),
-        models.is_noise_stated,
-    )
-    refitted_model = other_models.fit_one(FitStart(names, theta, model.fit.initial_states))
-    if models.evaluator.discretisation_correction is None:
-        return refitted_model
-    # Both forms are compared without the discretisation error of the integrator.
-    from bench.diagnosis.evaluation.discretisation_error import correct_discretisation
-
-    correct_discretisation(
-        evaluator, models.noise, refitted_model.fit.theta, refitted_model.fit.initial_states
-    )
-    # Otherwise the fit without the correction, which is known, might be returned again.
-    other_models.models.clear()
-    return other_models.fit_one(refitted_model.fit.make_start())

@@ -26,13 +26,14 @@ from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
 from bench.diagnosis.kalman.candidate_responses import compute_sensitivities
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.regression_products import GramMatrices
-from bench.diagnosis.prediction_error.regression_selection import Regression, group_probes
+from bench.diagnosis.prediction_error.regression_selection import Regression
 from bench.diagnosis.prediction_error.settled_simulations import SettledSimulations
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_by_simulation,
     is_explained,
     remove_idle_effects,
 )
+from bench.diagnosis.search.score_test import group_probes
 from sims.core.effect import members_of
 from sims.core.simulator import Array
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS

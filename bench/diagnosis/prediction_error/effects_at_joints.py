@@ -1,7 +1,7 @@
-"""Joints at which effects act, and the effects that act alike at a joint.
+"""Joints at which effects act, and the effects that are tried first at a joint.
 
-The effects of the standard joint and servo models are those that are tried first at a joint. Others
-imitate one another: delays of commands and of sensors, or an effect at the joints of a closed loop.
+These are the effects of the standard joint and servo models. They often imitate other effects at
+the same joint.
 """
 
 from __future__ import annotations
@@ -80,8 +80,13 @@ def acts_at_joint(evaluator: RunEvaluator, name: str, joints: Collection[int]) -
     )
 
 
-def list_joints(evaluator: RunEvaluator, name: str) -> set[int]:
-    """Return the indices of the joints at which an effect acts."""
+def list_joints_of_effect(evaluator: RunEvaluator, name: str) -> set[int]:
+    """Return the indices of the joints at which an effect acts.
+
+    Args:
+        evaluator: the runs.
+        name: name of the effect.
+    """
     count = len(evaluator.simulator.system.coordinates)
     return {joint for joint in range(count) if acts_at_joint(evaluator, name, {joint})}
 
@@ -113,33 +118,6 @@ def get_only_joint(evaluator: RunEvaluator, name: str) -> int | None:
     return joint
 
 
-def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
-    """Return the effects of the joint and servo models at the joints where an effect acts.
-
-    These simple effects (Coulomb friction, drag, armature, stiffness and damping of the servo)
-    often imitate another effect at the same joint. Families (effects at every place, ``@*``) are
-    left out, unless the effect is one.
-
-    Args:
-        evaluator: the runs.
-        name: name of the effect; at a body, the joints are those that move this body against its
-            parent.
-    """
-    joints = list_joints(evaluator, name)
-    if evaluator.available_effects[name].at == "body":
-        body = name.partition("@")[2]
-        joints = {
-            joint for joint, moved in enumerate(list_moved_bodies(evaluator)) if moved == body
-        }
-    return {
-        other
-        for other in evaluator.library
-        if other.partition("@")[0] in JOINT_MODEL + SERVO_MODEL
-        and (name.endswith("@*") or not other.endswith("@*"))
-        and acts_at_joint(evaluator, other, joints)
-    }
-
-
 def is_time_shift(effect: Effect) -> bool:
     """Return whether an effect is a delay or a lag, with one coefficient."""
     return [c.of for c in effect.coefficients] == ["shift"]
@@ -156,6 +134,33 @@ def list_moved_bodies(evaluator: RunEvaluator) -> list[str]:
     assert isinstance(evaluator.simulator, RobotSimulator)
     model = evaluator.simulator.robot.compiled
     return [model.body(b).name for b in model.dof_bodyid[evaluator.simulator.addresses.velocities]]
+
+
+def list_joint_model_effects(evaluator: RunEvaluator, name: str) -> set[str]:
+    """Return the effects of the joint and servo models at the joints where an effect acts.
+
+    These simple effects (Coulomb friction, drag, armature, stiffness and damping of the servo)
+    often imitate another effect at the same joint. Families (effects at every place, ``@*``) are
+    left out, unless the effect is one.
+
+    Args:
+        evaluator: the runs.
+        name: name of the effect; at a body, the joints are those that move this body against its
+            parent.
+    """
+    joints = list_joints_of_effect(evaluator, name)
+    if evaluator.available_effects[name].at == "body":
+        body = name.partition("@")[2]
+        joints = {
+            joint for joint, moved in enumerate(list_moved_bodies(evaluator)) if moved == body
+        }
+    return {
+        other
+        for other in evaluator.library
+        if other.partition("@")[0] in JOINT_MODEL + SERVO_MODEL
+        and (name.endswith("@*") or not other.endswith("@*"))
+        and acts_at_joint(evaluator, other, joints)
+    }
 
 
 def has_series(evaluator: RunEvaluator, names: Iterable[str]) -> bool:

@@ -1,4 +1,9 @@
-"""Fits of elasticity and backlash between a drive and its links, which filters do not follow."""
+"""Simulate and fit elasticity and backlash between a drive and its links.
+
+These series effects (an elastic joint, or one with a gap, in series with a joint) have states of
+their own, which filters do not follow. A regression does not find them, so that each is simulated
+at several coefficients, and those with the lowest cost are fitted.
+"""
 
 from __future__ import annotations
 
@@ -42,30 +47,10 @@ def simulate_series_effects(context: SearchContext, selected: Selected) -> list[
     evaluator = context.evaluator
     joints = {followed.joints_by_loss[0] for followed in (context.filters.base, selected.followed)}
     alone = FitStart((), context.filters.reference, evaluator.initial_state_guesses)
-    return _simulate_series_effects(context, alone, joints)
+    return _simulate_at_joints(context, alone, joints)
 
 
-def add_series_effect(context: SearchContext, best: FittedModel) -> FittedModel:
-    """Return a model with an elastic joint or backlash in addition, if that is likelier.
-
-    A regression does not find these effects, so that a model with the other cause of a pair is the
-    best one without them.
-
-    Args:
-        context: search, filters and regressions of the recording.
-        best: the best model so far, which does not explain the runs.
-    """
-    if not best.effects or has_series(context.evaluator, best.effects):
-        return best
-    joints = {context.filters.get_filter(best).joints_by_loss[0]}
-    simulated = _simulate_series_effects(context, best.fit.make_start(), joints)
-    added = fit_series_effects(context, simulated, best.fit.cost)
-    if not added.effects:
-        return best
-    return select_likeliest(best, remove_idle_effects(context, added))
-
-
-def _simulate_series_effects(
+def _simulate_at_joints(
     context: SearchContext, start: FitStart, joints: Collection[int]
 ) -> list[RatedStart]:
     """Simulate elasticity and backlash at some joints, in addition to the effects of a model.
@@ -98,6 +83,25 @@ def _simulate_series_effects(
     return select_lowest_of_each(context, starts)
 
 
+def _list_series_coefficients(context: SearchContext, name: str) -> list[Array]:
+    """Return the trial coefficients (k,) of an effect between a drive and its link.
+
+    A fit from a much larger gap than the true one ends in a local minimum, so that shares of the
+    smallest trial coefficient are added to the trial coefficients of the library (probes).
+
+    Args:
+        context: search, filters and regressions of the recording.
+        name: name of the effect; its first coefficient is a compliance or a gap.
+    """
+    probes = [probe.coefficients for probe in context.columns.probes([name])]
+    smallest = min(probes, key=lambda coefficients: float(coefficients[0]))
+    for share in SMALLER_SERIES_SHARES:
+        smaller = smallest.copy()
+        smaller[0] *= share
+        probes.append(smaller)
+    return probes
+
+
 def fit_series_effects(
     context: SearchContext, simulated: Sequence[RatedStart], limit: float = np.inf
 ) -> FittedModel:
@@ -122,20 +126,21 @@ def fit_series_effects(
     return fit_by_simulation(context, select_likeliest(*search.fit_all(starts)).fit.make_start())
 
 
-def _list_series_coefficients(context: SearchContext, name: str) -> list[Array]:
-    """Return the trial coefficients (k,) of an effect between a drive and its link.
+def add_series_effect(context: SearchContext, best: FittedModel) -> FittedModel:
+    """Return a model with an elastic joint or backlash in addition, if that is likelier.
 
-    A fit from a much larger gap than the true one ends in a local minimum, so that shares of the
-    smallest trial coefficient are added to the trial coefficients of the library (probes).
+    A regression does not find these effects, so that a model with the other cause of a pair is the
+    best one without them.
 
     Args:
         context: search, filters and regressions of the recording.
-        name: name of the effect; its first coefficient is a compliance or a gap.
+        best: the best model so far, which does not explain the runs.
     """
-    probes = [probe.coefficients for probe in context.columns.probes([name])]
-    smallest = min(probes, key=lambda coefficients: float(coefficients[0]))
-    for share in SMALLER_SERIES_SHARES:
-        smaller = smallest.copy()
-        smaller[0] *= share
-        probes.append(smaller)
-    return probes
+    if not best.effects or has_series(context.evaluator, best.effects):
+        return best
+    joints = {context.filters.get_filter(best).joints_by_loss[0]}
+    simulated = _simulate_at_joints(context, best.fit.make_start(), joints)
+    added = fit_series_effects(context, simulated, best.fit.cost)
+    if not added.effects:
+        return best
+    return select_likeliest(best, remove_idle_effects(context, added))

@@ -15,17 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.diagnosis.dry_friction_form import has_soft_form, make_soft_kind
-from bench.diagnosis.evaluation.parameter_bounds import clip_coefficients, get_bounds_by_index
+from bench.diagnosis.evaluation.parameter_bounds import get_bounds_by_index
 from bench.diagnosis.fitting.fitted_models import FittedModel
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.kalman.likelihood_fit import maximise_innovation_likelihood
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-from bench.diagnosis.prediction_error.effects_at_joints import (
-    get_joint_name,
-    get_only_joint,
-    has_series,
-)
-from bench.diagnosis.prediction_error.settled_simulations import SettledSimulations
+from bench.diagnosis.prediction_error.effects_at_joints import get_only_joint
 from bench.diagnosis.search.scored_models import ScoredModelSet
 from sims.core.simulator import Array
 from sims.robot.robot_simulator import RobotSimulator
@@ -42,10 +37,6 @@ RELINEARISATION_THRESHOLD = 100.0
 """Minimum change of the smoothed motion, in units of the noise, for another linearisation."""
 GAUSS_NEWTON_STEPS = 2
 """Maximum number of Gauss-Newton steps for an effect that is tried in the model."""
-SOFT_FACTORS = (0.5, 0.8, 1.2, 1.8)
-"""Friction forces tried for dry friction in the soft form, as multiples of the missing force."""
-
-
 COMPETING_MODEL_MARGIN = 20.0
 """Maximum distance in twice the log-likelihood of sets that are compared by simulation."""
 LINEARISATION_ERROR = 0.03
@@ -86,15 +77,17 @@ class ModelFilters:
     Attributes:
         models: the base model and the fitted models.
         numerics: share of the integrator's step errors that the selection puts into the model.
+        soft_friction: likeliest models of soft dry friction by effect and sign, which
+            `dry_friction_fits` caches here.
     """
 
     models: ScoredModelSet
     numerics: float = 0.0
+    soft_friction: dict[tuple[str, float], FitStart | None] = field(default_factory=dict)
     _of_models: dict[bytes, FollowedRuns] = field(default_factory=dict)
     _of_sets: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
     _newest: FollowedRuns | None = None
     _likelihoods: dict[tuple[bytes, bool], float] = field(default_factory=dict)
-    _soft_friction: dict[tuple[str, float], FitStart | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.evaluator, self.noise = self.models.evaluator, self.models.noise
@@ -102,7 +95,7 @@ class ModelFilters:
     def take_over(self, other: ModelFilters) -> None:
         """Reuse the likelihoods that another search of the same models has computed."""
         self._likelihoods = other._likelihoods
-        self._soft_friction = other._soft_friction
+        self.soft_friction = other.soft_friction
 
     @cached_property
     def reference(self) -> Array:
@@ -227,12 +220,25 @@ class ModelFilters:
         key = theta.tobytes(), is_soft
         if key not in self._likelihoods:
             followed = (
-                self.base.with_parameters(theta, self._soft_simulator)
-                if is_soft
-                else self._follow_about_base(theta)
+                self.follow_with_soft_friction(theta) if is_soft else self._follow_about_base(theta)
             )
             self._likelihoods[key] = followed.log_likelihood
         return self._likelihoods[key]
+
+    def follow_with_soft_friction(
+        self, theta: Array, similar: FollowedRuns | None = None
+    ) -> FollowedRuns:
+        """Follow the runs with a model whose effects add dry friction in MuJoCo's soft form.
+
+        The model is linearised about the motion of the base model. Its log-likelihood is cached.
+
+        Args:
+            theta: (P,) parameters of the model.
+            similar: a filter with a similar model, whose Jacobians are used; None to compute them.
+        """
+        followed = self.base.with_parameters(theta, self._soft_simulator, similar)
+        self._likelihoods[theta.tobytes(), True] = followed.log_likelihood
+        return followed
 
     def _follow_about_base(self, theta: Array) -> FollowedRuns:
         """Follow the runs with other parameters, linearised about the motion of the base model.
@@ -320,42 +326,6 @@ class ModelFilters:
         states[:, : positions.shape[1]] = np.where(is_offset, positions, measured_positions)
         return states
 
-    def estimate_start(self, start: FitStart) -> FitStart:
-        """Return a start with first states for its parameters, and derivatives by these states.
-
-        For a robot on the ground, another radius or mass has contacts of another depth, and the
-        derivatives depend on which contacts are closed. First states are estimated by a filter with
-        the start's parameters, then coefficients, then states again. A fit of both together would
-        leave the states in which contacts are in equilibrium, and stop there. The improved
-        coefficients and states are used if their residual is smaller.
-
-        Args:
-            start: start of a fit.
-
-        Returns:
-            The start; the given one for elastic joints, or if the filter diverges.
-        """
-        # Elastic joints have states that no reading shows; their fits begin as given.
-        if has_series(self.evaluator, start.effects):
-            return start
-        # The first states of the base model are biased by what is missing.
-        followed = FollowedRuns.follow(
-            self.evaluator, start.theta, self.noise, max_linearisations=1
-        )
-        if not followed.has_expected_innovations:
-            return start
-        states, fitter = followed.improved_first_states, followed.first_state_fitter
-        refined = SettledSimulations(fitter, states).refine(start)
-        refined_states = fitter.fit_settled_states(refined.theta, states)
-        cost = fitter.compute_squares(start.theta, states).sum()
-        if fitter.compute_squares(refined.theta, refined_states).sum() < cost:
-            start, states = refined, refined_states
-        return replace(
-            start,
-            initial_states=states,
-            state_jacobian=followed.compute_state_sensitivities(),
-        )
-
     def penalty(self, name: str) -> float:
         """Return the minimum gain of an effect with k coefficients in twice the log-likelihood.
 
@@ -372,96 +342,9 @@ class ModelFilters:
         """True if effects add dry friction in MuJoCo's soft form."""
         return has_soft_form(self.evaluator)
 
-    def find_soft_friction(self, name: str, sign: float) -> FitStart | None:
-        """Return the likeliest model of dry friction in MuJoCo's soft form, by filters.
-
-        The likelihood has one maximum over the force, which is searched from the middle of a few
-        forces. The result is cached.
-
-        Args:
-            name: name of the effect: dry friction at a joint.
-            sign: 1 for more friction than in the model file, -1 for less.
-
-        Returns:
-            The model; None if friction is already soft.
-        """
-        if (name, sign) not in self._soft_friction:
-            self._soft_friction[name, sign] = self._search_soft_friction(name, sign)
-        return self._soft_friction[name, sign]
-
-    def _search_soft_friction(self, name: str, sign: float) -> FitStart | None:
-        """Search the friction force of the model that `find_soft_friction` returns.
-
-        The models have a few friction forces in ascending order. Beginning at the middle, the
-        search goes in the direction in which the log-likelihood of the filter increases, and stops
-        where it decreases.
-
-        Args:
-            name: name of a friction effect at a joint.
-            sign: 1 for more friction than in the model file, -1 for less.
-
-        Returns:
-            Start of a fit with the likeliest force; None if there are no models to try.
-        """
-        joint = name.partition("@")[2]
-        joint_indices = {get_joint_name(self.evaluator, j): j for j in range(self.base.force.size)}
-        models = make_soft_friction_models(self.base, self.reference, joint_indices[joint], sign)
-        if not models:
-            return None
-        followed: dict[int, FollowedRuns] = {}
-
-        def log_likelihood(number: int) -> float:
-            """Return the log-likelihood of a model; its filter is made when it is needed."""
-            if number not in followed:
-                # Jacobians depend little on the force.
-                similar = next(iter(followed.values()), None)
-                theta = models[number]
-                followed[number] = self.base.with_parameters(theta, self._soft_simulator, similar)
-                self._likelihoods[theta.tobytes(), True] = followed[number].log_likelihood
-            return followed[number].log_likelihood
-
-        middle = len(models) // 2
-        step = 1 if log_likelihood(middle) > log_likelihood(middle - 1) else -1
-        best = middle if step > 0 else middle - 1
-        while 0 <= best + step < len(models) and log_likelihood(best + step) > log_likelihood(best):
-            best += step
-        return FitStart((name,), models[best], self.estimate_first_states(self.base))
-
     @cached_property
     def _soft_simulator(self) -> RobotSimulator:
         """Simulator with dry friction in MuJoCo's soft form."""
         simulator = self.evaluator.make_simulator(make_soft_kind(self.evaluator.kind))
         assert isinstance(simulator, RobotSimulator)
         return simulator
-
-
-def make_soft_friction_models(
-    followed: FollowedRuns, theta: Array, joint: int, sign: float = 1.0
-) -> list[Array]:
-    """Return models with dry friction of several sizes at a joint, for a search of the best size.
-
-    They are for a simulator with MuJoCo's soft form. The sizes are multiples of the force that the
-    filter misses at the joint. The list is empty if the library has no such effect, or if friction
-    is already soft.
-
-    Args:
-        followed: the runs, without the effect.
-        theta: (P,) parameters without the effect.
-        joint: index of the joint.
-        sign: 1 for more friction than in the model file, -1 for less.
-
-    Returns:
-        The parameters (P,) of each model, in ascending order of the size.
-    """
-    evaluator = followed.evaluator
-    name = f"friction.coulomb@{get_joint_name(evaluator, joint)}"
-    if has_soft_form(evaluator) or name not in evaluator.library:
-        return []
-    models = []
-    for factor in SOFT_FACTORS:
-        # The missing force of a sliding joint is about the force of its friction.
-        size = np.array([sign * factor * float(followed.force[joint])])
-        changed = theta.copy()
-        changed[evaluator.coefficient_slices[name]] = clip_coefficients(evaluator, name, size)
-        models.append(changed)
-    return models

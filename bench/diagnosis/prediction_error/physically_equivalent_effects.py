@@ -1,8 +1,15 @@
-"""Move a payload to a neighbouring body.
+"""List the effects that may act like a given one, for physical reasons.
 
-A point mass near the axis of a joint, or at a joint that hardly moves, acts nearly alike on both
-bodies of the joint. The response to a payload is not linear in its place, so a regression far from
-the right place does not show this; the moved payload does.
+- A lag acts like a delay, and a command that comes late nearly like readings that come late.
+- The armature of a joint acts like the inertia of the link that it moves, and a payload near the
+  centre of mass like a heavier body.
+- The damping of a servo acts like that of its joint.
+- An effect at a joint may act like the same effect at another joint of its kinematic loop.
+- A payload near the axis of a joint, or at a joint that hardly moves, acts nearly alike on both
+  bodies of the joint.
+
+Some of these responses are far from linear in the coefficients, so that a regression may miss the
+equivalent effect. Its coefficients are therefore computed here.
 """
 
 from __future__ import annotations
@@ -16,64 +23,12 @@ from bench.diagnosis.prediction_error.effects_at_joints import (
     get_joint_name,
     get_servo_input,
     is_time_shift,
-    list_joints,
+    list_joints_of_effect,
     list_moved_bodies,
 )
 from sims.core.simulator import Array
 from sims.robot.inertia_tensors import compute_inertia_tensors
 from sims.robot.robot_simulator import RobotSimulator
-
-
-def list_moved_payloads(
-    evaluator: RunEvaluator, name: str, coefficients: Array
-) -> list[tuple[str, Array]]:
-    """Return a payload moved to the bodies that joints connect with its body.
-
-    The payload stays where it is in space in the mean pose in which the runs begin; its position is
-    clipped to the bounds of the other body.
-
-    Args:
-        evaluator: the runs.
-        name: name of the effect, such as ``payload@forearm``.
-        coefficients: (4,) mass in kg, and position in m from the centre of mass of the body, in its
-            frame.
-
-    Returns:
-        Names and coefficients (4,) of payloads in the evaluator; empty for any other effect.
-    """
-    law, _, place = name.partition("@")
-    simulator = evaluator.simulator
-    if law != "payload" or not isinstance(simulator, RobotSimulator):
-        return []
-    # This import is needed for robots only.
-    import mujoco
-
-    robot, model = simulator.robot, simulator.robot.compiled
-    bodies = {body.name: body.id for body in robot.bodies}
-    if place not in bodies:
-        return []
-    data, coordinates = mujoco.MjData(model), len(simulator.addresses.positions)
-    begin = evaluator.initial_state_guesses[:, :coordinates].mean(axis=0)
-    data.qpos[simulator.addresses.positions] = begin
-    mujoco.mj_kinematics(model, data)
-    # Frames of bodies have origin `xpos` and rotation `xmat`; `body_ipos` is the centre of mass.
-    body = bodies[place]
-    mass, position = coefficients[:1], coefficients[1:]
-    # The point mass in the frame of the world.
-    point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ (model.body_ipos[body] + position)
-    # Parent of each body. A body without joints moves with the body to which it is welded.
-    parent = model.body_weldid[model.body_parentid]
-    moved = []
-    for other_name, other in bodies.items():
-        effect = f"payload@{other_name}"
-        are_linked = parent[other] == body or parent[body] == other
-        if not are_linked or effect not in evaluator.coefficient_slices:
-            continue
-        rotation = data.xmat[other].reshape(3, 3)
-        other_position = rotation.T @ (point - data.xpos[other]) - model.body_ipos[other]
-        low, high = np.array(compute_coefficient_bounds(evaluator, effect)).T
-        moved.append((effect, np.clip(np.concatenate([mass, other_position]), low, high)))
-    return moved
 
 
 def list_similar_shifts(evaluator: RunEvaluator, name: str) -> list[str]:
@@ -90,7 +45,7 @@ def list_similar_shifts(evaluator: RunEvaluator, name: str) -> list[str]:
     """
     if not is_time_shift(evaluator.available_effects[name]):
         return []
-    joints = list_joints(evaluator, name)
+    joints = list_joints_of_effect(evaluator, name)
 
     def has_one_place(effect: str) -> bool:
         """Return whether the effect has no family ``@*``, because it has a single place."""
@@ -156,27 +111,57 @@ def list_similar_inertias(
     return [(other, np.clip(c, *ends)) for (other, c), ends in zip(known, bounds, strict=True)]
 
 
-def get_servo_damping(evaluator: RunEvaluator, joint: int) -> tuple[str, float] | None:
-    """Return the effect that scales a servo's damping, and the damping of its joint per unit of it.
+def list_moved_payloads(
+    evaluator: RunEvaluator, name: str, coefficients: Array
+) -> list[tuple[str, Array]]:
+    """Return a payload moved to the bodies that joints connect with its body.
+
+    The response to a payload is not linear in its place, so a regression far from the right place
+    does not show that the moved payload acts alike. The payload stays where it is in space in the
+    mean pose in which the runs begin; its position is clipped to the bounds of the other body.
 
     Args:
-        evaluator: the runs of a robot.
-        joint: index of the joint.
+        evaluator: the runs.
+        name: name of the effect, such as ``payload@forearm``.
+        coefficients: (4,) mass in kg, and position in m from the centre of mass of the body, in its
+            frame.
 
     Returns:
-        Name of the effect, and the damping in N·m·s/rad (N·s/m for a slider) that it adds to the
-        joint by a relative change of 1; None if no servo with a known damping drives the joint.
+        Names and coefficients (4,) of payloads in the evaluator; empty for any other effect.
     """
+    law, _, place = name.partition("@")
     simulator = evaluator.simulator
-    servo = get_servo_input(evaluator, joint).removeprefix("u.")
-    name = f"actuator.damping@{servo}"
-    if not isinstance(simulator, RobotSimulator) or name not in evaluator.library:
-        return None
-    # The third bias parameter of MuJoCo's servo is minus its damping.
-    actuator, model = simulator.robot.actuator(servo).id, simulator.robot.compiled
-    gear, servo_damping = model.actuator_gear[actuator, 0], -model.actuator_biasprm[actuator, 2]
-    damping = float(gear**2 * servo_damping)
-    return (name, damping) if damping > 0.0 else None
+    if law != "payload" or not isinstance(simulator, RobotSimulator):
+        return []
+    # This import is needed for robots only.
+    import mujoco
+
+    robot, model = simulator.robot, simulator.robot.compiled
+    bodies = {body.name: body.id for body in robot.bodies}
+    if place not in bodies:
+        return []
+    data, coordinates = mujoco.MjData(model), len(simulator.addresses.positions)
+    begin = evaluator.initial_state_guesses[:, :coordinates].mean(axis=0)
+    data.qpos[simulator.addresses.positions] = begin
+    mujoco.mj_kinematics(model, data)
+    # Frames of bodies have origin `xpos` and rotation `xmat`; `body_ipos` is the centre of mass.
+    body = bodies[place]
+    mass, position = coefficients[:1], coefficients[1:]
+    # The point mass in the frame of the world.
+    point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ (model.body_ipos[body] + position)
+    # Parent of each body. A body without joints moves with the body to which it is welded.
+    parent = model.body_weldid[model.body_parentid]
+    moved = []
+    for other_name, other in bodies.items():
+        effect = f"payload@{other_name}"
+        are_linked = parent[other] == body or parent[body] == other
+        if not are_linked or effect not in evaluator.coefficient_slices:
+            continue
+        rotation = data.xmat[other].reshape(3, 3)
+        other_position = rotation.T @ (point - data.xpos[other]) - model.body_ipos[other]
+        low, high = np.array(compute_coefficient_bounds(evaluator, effect)).T
+        moved.append((effect, np.clip(np.concatenate([mass, other_position]), low, high)))
+    return moved
 
 
 def list_similar_dampings(
@@ -206,6 +191,29 @@ def list_similar_dampings(
         if name == joint_effect:
             return [(servo_effect, coefficients / damping)]
     return []
+
+
+def get_servo_damping(evaluator: RunEvaluator, joint: int) -> tuple[str, float] | None:
+    """Return the effect that scales a servo's damping, and the damping of its joint per unit of it.
+
+    Args:
+        evaluator: the runs of a robot.
+        joint: index of the joint.
+
+    Returns:
+        Name of the effect, and the damping in N·m·s/rad (N·s/m for a slider) that it adds to the
+        joint by a relative change of 1; None if no servo with a known damping drives the joint.
+    """
+    simulator = evaluator.simulator
+    servo = get_servo_input(evaluator, joint).removeprefix("u.")
+    name = f"actuator.damping@{servo}"
+    if not isinstance(simulator, RobotSimulator) or name not in evaluator.library:
+        return None
+    # The third bias parameter of MuJoCo's servo is minus its damping.
+    actuator, model = simulator.robot.actuator(servo).id, simulator.robot.compiled
+    gear, servo_damping = model.actuator_gear[actuator, 0], -model.actuator_biasprm[actuator, 2]
+    damping = float(gear**2 * servo_damping)
+    return (name, damping) if damping > 0.0 else None
 
 
 def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:

@@ -23,8 +23,9 @@ residual of a set is only noise. The order is:
     4. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
        filters with the effect in the model (`stepwise_selection_by_filters`).
     5. Try one effect in place of several (`competing_models`).
-    6. Simulate elasticity and backlash between a drive and its links (`single_effect_fits`). Those
-       that remove most of the residual without being fitted come before 3.
+    6. Simulate elasticity and backlash between a drive and its links
+       (`elasticity_and_backlash_fits`). Those that remove most of the residual without being fitted
+       come before 3.
 
 If a long recording shows that the model stays incomplete, filters alone identify its effects
 (`stepwise_selection_by_filters`), and nothing of the above is done.

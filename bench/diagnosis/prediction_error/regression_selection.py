@@ -41,14 +41,14 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.benchmark.statistics.chi_squared import chi_squared_quantile, chi_squared_tail
-from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
+from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.kalman.candidate_responses import (
     Columns,
     compute_columns,
     compute_responses,
     compute_step_error_response,
 )
-from bench.diagnosis.kalman.kalman_recursions import IndexArray, Mask
+from bench.diagnosis.kalman.kalman_recursions import IndexArray
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.prediction_error.regression_products import GramMatrices, ResponseProducts
 from bench.diagnosis.search.score_test import (
@@ -57,6 +57,7 @@ from bench.diagnosis.search.score_test import (
     DirectionGroup,
     batch_groups,
     compute_explained_squares,
+    group_probes,
 )
 from sims.core.simulator import Array
 
@@ -74,6 +75,12 @@ RIDGE = 1e-10
 """Ridge, as a share of each column's sum of squares."""
 SMALLEST_RSS = 1e-9
 """Minimum residual sum of squares, as a share of the sum of squares of the innovations."""
+NULL_DRAWS = 200
+"""Number of draws from the null distribution."""
+MAX_REGRESSIONS = 4
+"""Maximum number of regressions, each with the process noise of the previous selection."""
+MAX_SET_SIZE = 8
+"""Maximum number of effects in a set."""
 
 
 class LeastSquaresFit(NamedTuple):
@@ -461,27 +468,6 @@ def list_columns(groups: Sequence[DirectionGroup]) -> IndexArray:
     return np.array([c for group in groups for c in group.column_indices], dtype=np.intp)
 
 
-def group_probes(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
-    """Group the columns of the probes of one effect at one grid point, which act together.
-
-    The index of a column is that of its probe. A grid point is one shape of the effect, for
-    instance one period; the probes of a group differ in the coefficient that scales them.
-    """
-    columns_by_group: dict[tuple[str, int], list[int]] = {}
-    for i, probe in enumerate(probes):
-        columns_by_group.setdefault((probe.effect, probe.grid_point), []).append(i)
-    return [
-        DirectionGroup(
-            effect, tuple(columns), tuple(not probes[i].can_be_negative for i in columns)
-        )
-        for (effect, _), columns in columns_by_group.items()
-    ]
-
-
-NULL_DRAWS = 200
-"""Number of draws from the null distribution."""
-
-
 def compute_p_value_of_gain(gain: float, coefficients: int, candidates: int) -> float:
     """Return the p-value of the largest gain among several candidates.
 
@@ -554,12 +540,6 @@ def score_by_regression(
         null_scores=null_excesses[order],
         white_noise_scores=score[order],
     )
-
-
-MAX_REGRESSIONS = 4
-"""Maximum number of regressions, each with the process noise of the previous selection."""
-MAX_SET_SIZE = 8
-"""Maximum number of effects in a set."""
 
 
 @dataclass(frozen=True)

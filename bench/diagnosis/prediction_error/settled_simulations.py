@@ -25,9 +25,13 @@ from functools import cached_property
 
 import numpy as np
 
+from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.parameter_bounds import Bounds, get_bounds_by_index
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
+from bench.diagnosis.kalman.linearised_filter import FollowedRuns
 from bench.diagnosis.kalman.settled_first_states import FirstStateFitter
+from bench.diagnosis.prediction_error.effects_at_joints import has_series
 from sims.core.simulator import Array
 from sims.robot.dynamics.contact_equilibrium import KnownJacobians
 
@@ -162,6 +166,41 @@ class SettledSimulations:
         rows[:, : samples * channels] = values.reshape(runs, -1, count)
         projected: Array = rows - bases @ (bases.transpose(0, 2, 1) @ rows)
         return projected
+
+
+def estimate_settled_start(evaluator: RunEvaluator, noise: NoiseModel, start: FitStart) -> FitStart:
+    """Return a start with first states for its parameters, and derivatives by these states.
+
+    For a robot on the ground, another radius or mass has contacts of another depth, and the
+    derivatives depend on which contacts are closed. First states are estimated by a filter with the
+    start's parameters, then coefficients, then states again. A fit of both together would leave the
+    states in which contacts are in equilibrium, and stop there. The improved coefficients and
+    states are used if their residual is smaller.
+
+    Args:
+        evaluator: the runs of a robot on the ground.
+        noise: noise of the channels.
+        start: start of a fit.
+
+    Returns:
+        The start; the given one for elastic joints, or if the filter diverges.
+    """
+    # Elastic joints have states that no reading shows; their fits begin as given.
+    if has_series(evaluator, start.effects):
+        return start
+    # The first states of the base model are biased by what is missing.
+    followed = FollowedRuns.follow(evaluator, start.theta, noise, max_linearisations=1)
+    if not followed.has_expected_innovations:
+        return start
+    states, fitter = followed.improved_first_states, followed.first_state_fitter
+    refined = SettledSimulations(fitter, states).refine(start)
+    refined_states = fitter.fit_settled_states(refined.theta, states)
+    cost = fitter.compute_squares(start.theta, states).sum()
+    if fitter.compute_squares(refined.theta, refined_states).sum() < cost:
+        start, states = refined, refined_states
+    return replace(
+        start, initial_states=states, state_jacobian=followed.compute_state_sensitivities()
+    )
 
 
 def refine_with_wide_differences(

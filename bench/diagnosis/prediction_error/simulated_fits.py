@@ -21,6 +21,7 @@ from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.filters_with_effects import FilteredSet
 from bench.diagnosis.prediction_error.regression_selection import Selected
+from bench.diagnosis.prediction_error.settled_simulations import estimate_settled_start
 from bench.diagnosis.search.fit_starts import make_replacing_start
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.effect import members_of
@@ -52,12 +53,10 @@ MIN_FURTHER_GAIN_SHARE = 0.01
 
 The model of a real robot is never complete, and long recordings show this with certainty.
 """
-
 MAX_SINGLE_SQUARES_SHARE = 0.3
 """Maximum share of the squares beyond noise that a likely effect leaves before any fit."""
 MAX_NOISE_LIKE_COST = 1.5
 """Maximum mean squared residual, in units of the noise, at which no better start is searched."""
-
 MAX_STATE_ITERATIONS = 4
 """Maximum number of iterations for the initial states of the simulated runs."""
 
@@ -100,7 +99,7 @@ def fit_by_simulation(
     """
     search, evaluator = context.search, context.evaluator
     if context.filters.base.is_on_ground:
-        start = context.filters.estimate_start(start)
+        start = estimate_settled_start(evaluator, context.filters.noise, start)
     fitted = search.fit_one(start)
     if is_explained(context, fitted) or not np.isfinite(fitted.fit.cost):
         return fitted
@@ -137,6 +136,26 @@ def fit_states_alone(context: SearchContext, model: FittedModel) -> TrajectoryFi
     )
     (fit,) = fitter.fit_models([model.fit.make_start()])
     return fit
+
+
+def simulate_identified(context: SearchContext, start: FitStart) -> FittedModel:
+    """Simulate the runs with identified parameters, from fitted initial states.
+
+    Only the initial states are fitted, in a few iterations. The fit with the derivatives by all
+    parameters, which the search needs, then makes no step.
+
+    Args:
+        context: search, filters and regressions of the recording.
+        start: the parameters, and estimates of the initial states.
+    """
+    evaluator, search = context.evaluator, context.search
+    (fitted_states,) = TrajectoryFitter(
+        evaluator, search.noise, search.fixed_parameters, fits_parameters=False
+    ).fit_models([start], MAX_STATE_ITERATIONS)
+    (fit,) = TrajectoryFitter(evaluator, search.noise, search.fixed_parameters).fit_models(
+        [replace(start, initial_states=fitted_states.initial_states)], 0
+    )
+    return search.add_fit(fit)
 
 
 def make_filtered_start(context: SearchContext, current: FilteredSet) -> FitStart:
@@ -484,23 +503,3 @@ def is_slow_to_simulate(context: SearchContext, names: Sequence[str]) -> bool:
         for effect in effects
         for member in members_of(effect)
     )
-
-
-def simulate_identified(context: SearchContext, start: FitStart) -> FittedModel:
-    """Simulate the runs with identified parameters, from fitted initial states.
-
-    Only the initial states are fitted, in a few iterations. The fit with the derivatives by all
-    parameters, which the search needs, then makes no step.
-
-    Args:
-        context: search, filters and regressions of the recording.
-        start: the parameters, and estimates of the initial states.
-    """
-    evaluator, search = context.evaluator, context.search
-    (fitted_states,) = TrajectoryFitter(
-        evaluator, search.noise, search.fixed_parameters, fits_parameters=False
-    ).fit_models([start], MAX_STATE_ITERATIONS)
-    (fit,) = TrajectoryFitter(evaluator, search.noise, search.fixed_parameters).fit_models(
-        [replace(start, initial_states=fitted_states.initial_states)], 0
-    )
-    return search.add_fit(fit)

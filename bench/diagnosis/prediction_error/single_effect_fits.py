@@ -1,8 +1,10 @@
-"""Fit single effects alone by simulation, joint flexibility and backlash included.
+"""Fit single effects alone by simulation.
 
 A servo at its limit is not linear, so a regression misjudges effects there. The effects that are
 most likely missing are therefore simulated alone, as one batch: first each at several coefficients
 (`fit_likely_effects`), and if none of them explains the runs, each fitted (`fit_single_effects`).
+Those that compete with a single effect at a force limit are fitted further
+(`refine_at_force_limits`).
 """
 
 from __future__ import annotations
@@ -12,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
 from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.prediction_error.dry_friction_fits import check_filter, check_fit
@@ -38,6 +39,7 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     remove_idle_effects,
     select_lowest_of_each,
 )
+from bench.diagnosis.search.fit_starts import scale_effect
 from sims.core.effect import members_of
 
 SCANNED_FACTORS = (0.5, 2.0, 4.0)
@@ -55,7 +57,6 @@ MAX_NEARBY = 5
 """Maximum number of effects that are simulated at nearby coefficients, those that fit best."""
 MAX_REFINED = 3
 """Maximum number of effects that are fitted alone to convergence."""
-
 MAX_REFINED_EXCESS_SHARE = 0.25
 """Maximum excess residual of a competing fit that is refined, above that of the best model.
 
@@ -133,28 +134,12 @@ def _try_scaled(
     for _, start in rated_starts:
         (name,) = start.effects
         if len(context.evaluator.get_coefficient_indices(name)) == 1:
-            scaled += [scale_effect(context, start, name, factor) for factor in factors]
+            scaled += [scale_effect(context.evaluator, start, name, factor) for factor in factors]
     lowest = {rated.start.effects: rated for rated in rated_starts}
     for rated in select_lowest_of_each(context, scaled):
         if rated.cost < lowest[rated.start.effects].cost:
             lowest[rated.start.effects] = rated
     return sorted(lowest.values(), key=lambda rated: rated.cost)
-
-
-def scale_effect(context: SearchContext, start: FitStart, name: str, factor: float) -> FitStart:
-    """Return a start with the one coefficient of an effect scaled, within its bounds.
-
-    Args:
-        context: search, filters and regressions of the recording.
-        start: the start; it is not changed.
-        name: name of the effect.
-        factor: factor of its coefficient.
-    """
-    theta = start.theta.copy()
-    (index,) = context.evaluator.get_coefficient_indices(name)
-    ((low, high),) = compute_coefficient_bounds(context.evaluator, name)
-    theta[index] = np.clip(factor * theta[index], low, high)
-    return replace(start, theta=theta)
 
 
 def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStart]) -> FittedModel:

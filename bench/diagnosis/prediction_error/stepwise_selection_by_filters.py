@@ -1,34 +1,27 @@
-"""Forward selection of effects by Kalman filters: grow a set by the likeliest effect, one by one.
+"""Select effects step by step by the likelihoods of Kalman filters with effects in their model.
 
 If large forces are missing, the noise of the measured motion appears both in the innovations and in
 the responses of effects that depend on the same readings, and regression prefers these effects. A
-filter with the right effect in its model needs no process noise (forward selection; A. Miller,
-Subset Selection in Regression, 2nd ed., 2002, chapter 3). The best sets are fitted by simulation.
+filter with the right effects in its model needs no process noise, so its likelihood decides. There
+are three selections:
 
-Selection of effects by filters that have dry friction in their model.
-
-A joint that sticks makes a regression about the base model, which is linear, unreliable for all
-other effects. A filter with the friction in its model follows the joint, so that its innovations
-are nearly linear in the effects that are left: several are selected by one regression, and the next
-regression is made about a filter with these (iterated linearisation, as in the Gauss-Newton method;
-J. Nocedal, S. Wright, Numerical Optimization, 2nd ed., 2006, section 10.3). Only the last set is
-fitted by simulation.
-
-Identify the model of a long recording by one-step prediction errors, without simulating runs.
-
-A model of a real robot is never complete. Simulated over a long run without feedback, the forces
-that it lacks add up to a drift, so a fit of the simulation is biased, and every trial is slow. A
-filter attributes these forces to process noise and keeps the state near the data: its estimates are
-close to those of inverse dynamics (M. Gautier, A. Janot and P.-O. Vandanjon, IEEE Trans. Control
-Syst. Technol. 21, 428, 2013, doi:10.1109/TCST.2012.2185697).
-
-    1. Put the standard joint model and the inertia of every body into the filter's model, and
-       maximise the likelihood of the innovations.
-    2. Add effects of the library, chosen by regression of the innovations, while each pays and
-       predicts left-out runs better.
-    3. Remove effects that do not pay.
-
-If the filter then lacks no force, the model may be complete, and simulation decides.
+1. One by one (`add_to_model`, `add_to_dry_friction`, `select_in_model`): a set grows by the
+   likeliest effect (forward selection; A. Miller, Subset Selection in Regression, 2nd ed., 2002,
+   chapter 3). The best sets are fitted by simulation.
+2. Several at once (`select_with_friction`): a joint that sticks makes a regression about the base
+   model, which is linear, unreliable for all other effects. A filter with dry friction in its model
+   follows the joint, so that its innovations are nearly linear in the effects that are left. One
+   regression selects several of them, and the next one is made about a filter with these (iterated
+   linearisation, as in the Gauss-Newton method; J. Nocedal, S. Wright, Numerical Optimization, 2nd
+   ed., 2006, section 10.3). Only the last set is fitted by simulation.
+3. In long recordings (`identify_incomplete`): a model of a real robot is never complete. Simulated
+   over a long run without feedback, the forces that it lacks add up to a drift, so a fit of the
+   simulation is biased, and every trial is slow. A filter attributes these forces to process noise
+   and keeps the state near the data: its estimates are close to those of inverse dynamics (M.
+   Gautier, A. Janot and P.-O. Vandanjon, IEEE Trans. Control Syst. Technol. 21, 428, 2013,
+   doi:10.1109/TCST.2012.2185697). The textbook effects of joints and bodies are fitted, those that
+   do not pay are removed, and further ones are added while each pays and predicts left-out runs
+   better. If the filter then lacks no force, the model may be complete, and simulation decides.
 """
 
 from __future__ import annotations
@@ -61,10 +54,7 @@ from bench.diagnosis.prediction_error.dry_friction_fits import (
     make_dry_friction_start,
 )
 from bench.diagnosis.prediction_error.effect_proposals import SearchContext
-from bench.diagnosis.prediction_error.effects_at_joints import (
-    JOINT_MODEL,
-    SERVO_MODEL,
-)
+from bench.diagnosis.prediction_error.effects_at_joints import JOINT_MODEL, SERVO_MODEL
 from bench.diagnosis.prediction_error.filters_with_effects import (
     COMPETING_MODEL_MARGIN,
     FilteredSet,
@@ -93,8 +83,8 @@ from bench.diagnosis.prediction_error.simulated_fits import (
 from bench.diagnosis.search.fit_starts import add_effect_to_start
 from bench.diagnosis.search.score_test import DirectionGroup
 
-MAX_STEPS = 4
-"""Maximum number of effects that are added one after another."""
+MAX_SINGLE_STEPS = 4
+"""Maximum number of effects that are added one by one."""
 MAX_IMPROVED_TRIALS = 3
 """Maximum number of tried effects whose coefficients are improved at each step."""
 SETTLED_SHARE = 0.1
@@ -115,6 +105,40 @@ MAX_IMITATIONS = 2
 """Number of effects in a row that replace no missing force after which no other is added."""
 ALL_SERVOS_STEPS = 6
 """Maximum number of Gauss-Newton steps for the coefficients of all servos."""
+FRICTION_FAMILY = "friction.coulomb@*"
+"""Dry friction of all joints."""
+JOINT_MODEL_STEPS = 4
+"""Maximum number of Gauss-Newton steps for the coefficients of the standard joint model."""
+MAX_RELINEARISATIONS = 3
+"""Maximum number of regressions, each about a filter with the effects of the previous ones."""
+MIN_LONG_DURATION = 8.0
+"""Minimum duration in seconds of each run of a long recording."""
+MIN_LONG_EXCESS = 100.0
+"""Minimum excess of the base model at which a long recording is identified without simulation.
+
+It is in units of the noise. Smaller discrepancies are explained by simulation.
+"""
+MAX_LONG_JOINTS = 3
+"""Maximum number of joints of a robot with a long recording.
+
+More of them have too many coefficients for finite differences.
+"""
+TEXTBOOK_EFFECTS = ("friction.coulomb", "drag.linear", "inertia.scale")
+"""Effects that are in the model of a long recording from the start, at every place.
+
+The inertia of a body that moves along a straight line has no influence, and is removed.
+"""
+MAX_ADDED_TO_TEXTBOOK = 3
+"""Maximum number of effects that are added to the textbook model."""
+NEGLIGIBLE_FORCE_SHARE = 0.1
+"""Maximum missing forces, as a share of those of the base model, at which no effect is added."""
+MAX_SET_ITERATIONS = 6
+"""Maximum number of Gauss-Newton steps of a set together with the base parameters."""
+MIN_STEP_GAIN_SHARE = 0.003
+"""Minimum gain by a Gauss-Newton step of such a fit for which another step follows.
+
+It is a share of the gain over the base model so far.
+"""
 
 
 def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
@@ -233,7 +257,7 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
     # Number of the last effects in a row that replace no missing force.
     imitations = 0
     # The set to begin with has at least one effect, which counts as the first step.
-    for _ in range(MAX_STEPS - 1):
+    for _ in range(MAX_SINGLE_STEPS - 1):
         is_force_missing = current.followed.missing_forces.any()
         larger = _list_larger_that_pay(context, current) if is_force_missing else []
         if not larger:
@@ -469,14 +493,6 @@ def _fit_all_servos(context: SearchContext, likeliest: FilteredSet) -> FittedMod
     )
 
 
-FRICTION_FAMILY = "friction.coulomb@*"
-"""Dry friction of all joints."""
-JOINT_MODEL_STEPS = 4
-"""Maximum number of Gauss-Newton steps for the coefficients of the standard joint model."""
-MAX_RELINEARISATIONS = 3
-"""Maximum number of regressions, each about a filter with the effects of the previous ones."""
-
-
 def select_with_friction(context: SearchContext, selected: Selected) -> FittedModel:
     """Select the other effects with dry friction of all joints in the filter's model.
 
@@ -495,7 +511,7 @@ def select_with_friction(context: SearchContext, selected: Selected) -> FittedMo
     friction = make_dry_friction_start(context, selected)
     if FRICTION_FAMILY not in friction.effects:
         return context.search.base_model
-    current = _choose_start(context, friction)
+    current = _choose_friction_start(context, friction)
     for _ in range(MAX_RELINEARISATIONS):
         larger = _add_selected(context, current)
         if larger is None:
@@ -508,7 +524,7 @@ def select_with_friction(context: SearchContext, selected: Selected) -> FittedMo
     return remove_idle_effects(context, fitted) if is_explained(context, fitted) else fitted
 
 
-def _choose_start(context: SearchContext, friction: FitStart) -> FilteredSet:
+def _choose_friction_start(context: SearchContext, friction: FitStart) -> FilteredSet:
     """Return dry friction with the first selected effects, or the standard joint model.
 
     The standard joint model has viscous friction and motor inertia (armature) in addition to dry
@@ -524,15 +540,15 @@ def _choose_start(context: SearchContext, friction: FitStart) -> FilteredSet:
     """
     filters = context.filters
 
-    def compute_criterion(current: FilteredSet) -> float:
-        """Return the penalised log-likelihood of a set; higher is better."""
+    def compute_penalised(current: FilteredSet) -> float:
+        """Return twice the penalised log-likelihood of a set; higher is better."""
         penalty = sum(filters.penalty(name) for name in current.names)
         return 2.0 * current.followed.log_likelihood - penalty
 
     friction_alone = filters.follow_with_effects(friction.theta, friction.effects)
     # None if a regression adds nothing to the friction.
     selected = _add_selected(context, friction_alone) or friction_alone
-    return max(selected, _follow_joint_model(context, friction), key=compute_criterion)
+    return max(selected, _follow_joint_model(context, friction), key=compute_penalised)
 
 
 def _follow_joint_model(context: SearchContext, friction: FitStart) -> FilteredSet:
@@ -643,31 +659,6 @@ def _make_larger(
     return start
 
 
-MIN_SECONDS = 8.0
-"""Minimum duration in seconds of each run of a long recording."""
-MIN_EXCESS = 100.0
-"""Minimum excess of the base model, in units of the noise, that such a model may leave.
-
-A smaller discrepancy is explained by simulation.
-"""
-MAX_JOINTS = 3
-"""Maximum number of joints; more of them have too many coefficients for finite differences."""
-TEXTBOOK_EFFECTS = ("friction.coulomb", "drag.linear", "inertia.scale")
-"""Effects that are in the model from the start, at every place that has them.
-
-The inertia of a body that moves along a straight line has no influence, and is removed.
-"""
-MAX_ADDED = 3
-"""Maximum number of effects that are added to the textbook model."""
-NEGLIGIBLE_FORCE_SHARE = 0.1
-"""Maximum missing forces, as a share of those of the base model, at which no effect is added."""
-MAX_SET_ITERATIONS = 6
-"""Maximum number of Gauss-Newton steps of a set."""
-MIN_STEP_GAIN_SHARE = 0.003
-"""Minimum gain by a Gauss-Newton step for which another step follows, as a share of the gain so
-far."""
-
-
 @dataclass(frozen=True)
 class IdentifiedSet:
     """A set of effects identified together with the base parameters.
@@ -689,9 +680,10 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
 
     Prediction errors are the innovations of a Kalman filter. The textbook effects (Coulomb
     friction, drag, inertia of the bodies) are fitted in the filter's model, and those that gain too
-    little are removed. Then up to `MAX_ADDED` further effects are added, each with the largest gain
-    by regression, until the missing forces are negligible or no effect gains enough. The result is
-    simulated, but not fitted by simulation: an incomplete model drifts away over a long run.
+    little are removed. Then up to `MAX_ADDED_TO_TEXTBOOK` further effects are added, each with the
+    largest gain by regression, until the missing forces are negligible or no effect gains enough.
+    The result is simulated, but not fitted by simulation: an incomplete model drifts away over a
+    long run.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -703,7 +695,7 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
     evaluator, filters = context.evaluator, context.filters
     # RMS residual of the base model in units of the noise, minus one.
     excess = context.search.compute_excess_residual(context.search.base_model)
-    if not is_long(evaluator) or not excess > MIN_EXCESS or evaluator.search_control.is_over():
+    if not is_long(evaluator) or not excess > MIN_LONG_EXCESS or evaluator.search_control.is_over():
         return None
     evaluator.search_control.begin_stage("identifying the joints and bodies")
     textbook = [
@@ -711,10 +703,10 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
         for name in evaluator.library
         if name.partition("@")[0] in TEXTBOOK_EFFECTS and not name.endswith("@*")
     ]
-    current, gains = _prune_set(context, _fit_set(context, filters.base, textbook))
+    current, gains = _prune_set(context, _fit_with_base_parameters(context, filters.base, textbook))
     columns: Columns | None = None
-    for _ in range(MAX_ADDED):
-        if _is_negligible(context, current):
+    for _ in range(MAX_ADDED_TO_TEXTBOOK):
+        if _leaves_negligible_force(context, current):
             break
         columns = columns or _list_single_effects(context)
         larger = _add_next_effect(context, current, columns)
@@ -734,11 +726,11 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
 
 def is_long(evaluator: RunEvaluator) -> bool:
     """Return whether all runs of a robot with few joints are long."""
-    few = len(evaluator.simulator.system.coordinates) <= MAX_JOINTS
-    return few and all(run.times[-1] - run.times[0] >= MIN_SECONDS for run in evaluator.runs)
+    few = len(evaluator.simulator.system.coordinates) <= MAX_LONG_JOINTS
+    return few and all(run.times[-1] - run.times[0] >= MIN_LONG_DURATION for run in evaluator.runs)
 
 
-def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
+def _leaves_negligible_force(context: SearchContext, current: FilteredSet) -> bool:
     """Return whether a set leaves a negligible share of the base model's missing forces.
 
     Missing forces are the standard deviations of the process noise of a filter.
@@ -751,7 +743,7 @@ def _is_negligible(context: SearchContext, current: FilteredSet) -> bool:
     return not current.followed.has_missing_force or bool((current.followed.force < limits).all())
 
 
-def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bounds]:
+def _get_bounds_with_base(context: SearchContext, names: Sequence[str]) -> dict[int, Bounds]:
     """Return the bounds of the free base parameters and of some effects, by index in theta.
 
     Args:
@@ -764,8 +756,10 @@ def _get_bounds(context: SearchContext, names: Sequence[str]) -> dict[int, Bound
     return bounds | get_bounds_by_index(evaluator, names)
 
 
-def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str]) -> FilteredSet:
-    """Maximise the likelihood of the innovations with effects in the filter's model.
+def _fit_with_base_parameters(
+    context: SearchContext, followed: FollowedRuns, names: Sequence[str]
+) -> FilteredSet:
+    """Maximise the likelihood over the base parameters and some effects in the filter's model.
 
     Fitted are the free base parameters and the coefficients of the effects, by Gauss-Newton steps.
     They end when a step gains little compared with the gain over the base model so far.
@@ -779,7 +773,7 @@ def _fit_set(context: SearchContext, followed: FollowedRuns, names: Sequence[str
     min_gain = max(
         MIN_STEP_GAIN_SHARE * (followed.log_likelihood - base_log_likelihood), MIN_STEP_GAIN
     )
-    bounds = _get_bounds(context, names)
+    bounds = _get_bounds_with_base(context, names)
     best = maximise_innovation_likelihood(
         followed,
         bounds,
@@ -827,7 +821,7 @@ def _prune_set(
     """
     followed, names, lost_gain = current.followed, list(current.names), 0.0
     # The information is computed once; removing an effect only removes its rows and columns.
-    bounds = _get_bounds(context, names)
+    bounds = _get_bounds_with_base(context, names)
     information = compute_information(followed, bounds)
     min_gains = {name: _compute_min_gain(context, current, name) for name in names}
     while True:
@@ -835,7 +829,7 @@ def _prune_set(
             context.evaluator,
             followed.theta,
             names,
-            information.select(list(_get_bounds(context, names))),
+            information.select(list(_get_bounds_with_base(context, names))),
         )
         negligible = [name for name in names if gains[name] < min_gains[name]]
         if not negligible:
@@ -851,7 +845,7 @@ def _prune_set(
     if not np.array_equal(theta, followed.theta):
         followed = followed.with_parameters(theta)
     if lost_gain > 2.0 * MIN_STEP_GAIN:
-        return _prune_set(context, _fit_set(context, followed, names))
+        return _prune_set(context, _fit_with_base_parameters(context, followed, names))
     return FilteredSet(followed, tuple(names)), gains
 
 
@@ -886,7 +880,9 @@ def _add_next_effect(
     coefficients = group_coefficients(evaluator, columns.probes, best, solution)
     present_start = FitStart(current.names, current.followed.theta, evaluator.initial_state_guesses)
     start = add_effect_to_start(evaluator, present_start, best.effect, coefficients)
-    larger = _fit_set(context, current.followed.with_parameters(start.theta), start.effects)
+    larger = _fit_with_base_parameters(
+        context, current.followed.with_parameters(start.theta), start.effects
+    )
     gain = 2.0 * (larger.followed.log_likelihood - current.followed.log_likelihood)
     return larger if gain > _compute_min_gain(context, larger, best.effect) else None
 

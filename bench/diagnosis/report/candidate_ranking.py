@@ -1,4 +1,4 @@
-"""Ranking of the candidate causes: their order, their status, and which of them are shown."""
+"""Ranking of the candidate causes: order, status, selection for figures, and table of the page."""
 
 from __future__ import annotations
 
@@ -6,20 +6,17 @@ from typing import NamedTuple
 
 from bench.diagnosis.report.cause_and_value_text import (
     ALL_PLACES,
+    describe_effect,
     format_effect_name,
     format_effect_set,
-    format_sentence,
     get_place_kind,
     sanitise,
     split_effect_name,
-    strip_place,
 )
 from bench.diagnosis.report.diagnosed_places import find_joint
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.verdict import Candidate
 from bench.pages.page_table import Table
-from sims import effects
-from sims.core.simulator import InputError
 
 MAX_SHOWN_CANDIDATES = 12
 """Maximum number of candidates that a figure shows."""
@@ -27,7 +24,6 @@ MIN_FAMILY_SCORE_RATIO = 1.3
 """Minimum ratio of a family's score to that of its best place for the family to represent the
 effect.
 """
-
 BEST, ELSEWHERE = "the best of each effect", "the same at other places"
 """Labels of the rows of a robot's candidates, for the filter."""
 
@@ -152,7 +148,7 @@ def build_candidate_table(report: DiagnosisReportData) -> Table:
                 "place": "all" if place == ALL_PLACES else sanitise(place, 80),
                 "joint": find_joint(report, place_kind, place),
                 "shown": BEST if effect in representatives else ELSEWHERE,
-                "says": _get_effect_description(report, effect),
+                "says": describe_effect(report.verdict.causes, effect),
             }
         )
     return Table.from_rows(rows).without(_list_empty_columns(report))
@@ -172,24 +168,3 @@ def _map_indistinguishable_sets(report: DiagnosisReportData) -> dict[str, str]:
             members = [cause.effect, *cause.alternatives]
             sets |= dict.fromkeys(members, sanitise(format_effect_set(members), 160))
     return sets
-
-
-def _get_effect_description(report: DiagnosisReportData, name: str) -> str:
-    """Return the description of an effect as a sentence; for a cause, the one in the verdict.
-
-    It is empty for an effect that is not registered: one of a plugin that is not loaded, or a
-    numerical setting such as the time step.
-
-    Args:
-        report: content of the report.
-        name: name of the effect, with its place if it has one.
-    """
-    for cause in report.verdict.causes:
-        if cause.effect == name:
-            return format_sentence(strip_place(sanitise(cause.says, 400)))
-    base, place = split_effect_name(name)
-    try:
-        effect = effects.get_effect(base)
-    except InputError:
-        return ""
-    return format_sentence((effect.says_at_place if place else "") or effect.says)

@@ -1,6 +1,8 @@
-"""Text of causes and their places, and the order in which candidates are shown.
+"""Text of effects, causes and fitted values, for the summary, the figures and the page.
 
-Text of numbers, units and effect names, for the summary, the figures and the page.
+Effects and their places become nouns, causes become clauses, and fitted values have their unit and
+their interval or bound. The pages of `explain` import all text functions from this module,
+including the shared ones of `bench.pages.text_format`.
 """
 
 from __future__ import annotations
@@ -25,15 +27,11 @@ from sims.core.simulator import InputError
 from sims.extended_simulator import FittedValue
 from sims.robot.fitted_causes import GRAVITY_COMPENSATED
 
-# All text functions of explain's pages are imported from this module, including the shared ones.
-
 QUANTITY_LABELS: Mapping[str, str] = {"q": "position", "qd": "velocity", "tau": "torque"}
 """Quantities of a joint, by the first part of a channel's name; a sensor has its own row."""
-END = {"low": "lower", "high": "upper"}
-"""Words for the ends of a range."""
 ALL_PLACES = "*"
 """Place of a family: all places of one kind."""
-_AT = {
+_PLACE_WORDS = {
     "joint": ("at", "joints"),
     "actuator": ("at", "actuators"),
     "body": ("of", "bodies"),
@@ -53,8 +51,89 @@ NUMERICS_NAMES = {
     "numerics.iterations": "another number of iterations of the solver",
 }
 """Names of numerical settings as causes; they are errors of the model file, not effects."""
-_WRONG = re.compile(r"an? (wrong|misplaced) ")
+_WRONG_VALUE_NOUN = re.compile(r"an? (wrong|misplaced) ")
 """Pattern of nouns that name a wrong value, not a missing effect."""
+DIFFERENCE_EFFECTS = frozenset(
+    {"drag.linear", "drag.quadratic", "friction.coulomb", "spring.linear"}
+)
+"""Effects whose coefficient is a difference from the value in the model file."""
+_SHARE_ERROR = "the {} {{place}} is {{percent}} {{larger}} than the model file states"
+_DIFFERENCE_ERROR = "the {} {{place}} is {{size}} {{larger}} than the model file states"
+"""Clauses on a value with a relative error, and with an absolute one; see `MODEL_FILE_ERRORS`."""
+MODEL_FILE_ERRORS = {
+    "mass.scale": _SHARE_ERROR.format("mass"),
+    "inertia.scale": _SHARE_ERROR.format("inertia"),
+    "actuator.stiffness": _SHARE_ERROR.format("stiffness"),
+    "actuator.damping": _SHARE_ERROR.format("damping"),
+    "inertia.armature": _DIFFERENCE_ERROR.format("armature"),
+    "mass.offset": "the centre of mass {place} is {distance} from where the model file has it",
+    "joint.zero": "the zero {place}, for commands and readings, is {size} from that of the model "
+    "file",
+    "joint.axis": "the axis {place} is tilted by {angle} from the model file",
+    "link.length": "the distance {place} from its parent is {percent} {larger} than the model file "
+    "states",
+    "geom.radius": _SHARE_ERROR.format("radius"),
+    "contact.friction": _DIFFERENCE_ERROR.format("friction coefficient"),
+    "contact.softness": _SHARE_ERROR.format("time constant"),
+    "contact.damping": _SHARE_ERROR.format("damping ratio"),
+}
+"""Clause on how wrong a value of the model file is, by effect.
+
+Its fields are the place; the first coefficient in per cent or with its unit; the length of all
+coefficients as a vector, with their unit or as an angle; and ``larger`` or ``smaller``.
+"""
+_STEP_ERROR_TEXTS = {
+    "numerics.step": "the time step of the model file is too long",
+    "numerics.integrator": "the integrator of the model file does not reproduce the recording",
+    "numerics.cone": "the model file has another friction cone",
+    "numerics.impratio": "the model file has another impedance ratio of friction",
+    "numerics.noslip": "the model file has another number of iterations without slip",
+    "numerics.solver": "the model file has another constraint solver",
+    "numerics.iterations": "the model file has another number of iterations of the solver",
+}
+"""Description of wrong numerical settings of the model file; the cause names the correction."""
+END_WORDS = {"low": "lower", "high": "upper"}
+"""Adjectives of the bounds of a range."""
+MAX_NAMED_MEMBERS = 6
+"""Maximum number of members of a set that a sentence names; the remaining ones are counted."""
+MAX_PLACE_CHARACTERS = 64
+"""Maximum number of characters of a place's name in a list."""
+
+
+def split_effect_name(effect: str) -> tuple[str, str]:
+    """Split an effect into its registered name and its place, which is ``*`` for a family."""
+    base, _, place = effect.partition("@")
+    return base, place
+
+
+def get_place_kind(effect: str) -> str:
+    """Return the kind of an effect's places, such as ``joint`` or ``body``; empty if unknown."""
+    try:
+        kind: str = getattr(effects.get_effect(split_effect_name(effect)[0]), "at", "")
+    except InputError:
+        return ""
+    return kind if kind in _PLACE_WORDS else ""
+
+
+def is_parameter_error(effect: str) -> bool:
+    """Return whether the effect corrects a wrong value instead of adding a missing effect.
+
+    For example, ``mass.scale`` corrects the mass of the model file, while ``drag.linear`` adds a
+    force.
+
+    Args:
+        effect: Name of the effect, with its place if it has one.
+    """
+    base, place = split_effect_name(effect)
+    if base in NUMERICS_NAMES:
+        return True
+    try:
+        registered = effects.get_effect(base)
+    except InputError:
+        return False
+    return bool(
+        _WRONG_VALUE_NOUN.match((registered.noun_at_place if place else "") or registered.noun)
+    )
 
 
 def format_effect(effect: str) -> str:
@@ -93,40 +172,6 @@ def _format_effect_as_noun(name: str) -> str:
     return noun + format_places(get_place_kind(name), [place], is_parameter=is_parameter)
 
 
-def split_effect_name(effect: str) -> tuple[str, str]:
-    """Split an effect into its registered name and its place, which is ``*`` for a family."""
-    base, _, place = effect.partition("@")
-    return base, place
-
-
-def get_place_kind(effect: str) -> str:
-    """Return the kind of an effect's places, such as ``joint`` or ``body``; empty if unknown."""
-    try:
-        kind: str = getattr(effects.get_effect(split_effect_name(effect)[0]), "at", "")
-    except InputError:
-        return ""
-    return kind if kind in _AT else ""
-
-
-def is_parameter_error(effect: str) -> bool:
-    """Return whether the effect corrects a wrong value instead of adding a missing effect.
-
-    For example, ``mass.scale`` corrects the mass of the model file, while ``drag.linear`` adds a
-    force.
-
-    Args:
-        effect: Name of the effect, with its place if it has one.
-    """
-    base, place = split_effect_name(effect)
-    if base in NUMERICS_NAMES:
-        return True
-    try:
-        registered = effects.get_effect(base)
-    except InputError:
-        return False
-    return bool(_WRONG.match((registered.noun_at_place if place else "") or registered.noun))
-
-
 def format_places(
     kind: str, places: Sequence[str], conjunction: str = "or", is_parameter: bool = False
 ) -> str:
@@ -138,7 +183,7 @@ def format_places(
         conjunction: Conjunction before the last name.
         is_parameter: Whether the effect is a wrong value of the place: `` of joint elbow``.
     """
-    preposition, plural = _AT.get(kind, ("at", "places"))
+    preposition, plural = _PLACE_WORDS.get(kind, ("at", "places"))
     preposition = "of" if is_parameter else preposition
     names = [sanitise(place, 40) for place in places]
     if names == [ALL_PLACES]:
@@ -155,83 +200,24 @@ def format_effect_name(effect: str) -> str:
     return re.sub(r"^an? ", "", format_effect(effect))
 
 
-def format_sentence(text: object) -> str:
-    """Format text as a sentence, with a capital first letter and a final period.
+def shorten_effect_name(effect: str) -> str:
+    """Format an effect for a list: without its article, and without the kind of its place.
 
     Args:
-        text: Text of a file or of this project; control characters are removed.
+        effect: Name such as ``friction.coulomb@elbow``.
+
+    Returns:
+        Text such as "Coulomb friction at elbow".
     """
-    sanitised_text = sanitise(text)
-    if not sanitised_text:
-        return sanitised_text
-    # A name with digits or underscores stays unchanged.
-    first_word, *_ = sanitised_text.split()
-    if first_word.rstrip(",:;.").isalpha():
-        sanitised_text = sanitised_text[0].upper() + sanitised_text[1:]
-    return sanitised_text if sanitised_text[-1] in ".!?…" else f"{sanitised_text}."
-
-
-def format_label(name: str, unit: str, max_length: int = 30) -> str:
-    """Format a label with its unit: ``q [rad]``, or ``q`` for a pure number.
-
-    Args:
-        name: Text of the label.
-        unit: Unit.
-        max_length: Maximum number of characters of the text.
-    """
-    label, unit_text = sanitise(name, max_length), format_unit(unit)
-    return f"{label} [{unit_text}]" if unit_text else label
-
-
-def shorten_label(name: object, unit: str = "1", max_length: int = 30) -> str:
-    """Format a text from a file, optionally with its unit, short enough for a label.
-
-    Args:
-        name: Text of the label.
-        unit: Unit; ``1`` for none.
-        max_length: Maximum number of characters of the text.
-    """
-    return format_label(sanitise(name, max_length), sanitise(unit, 12))
-
-
-def format_fitted_value(fitted: FittedValue) -> str:
-    """Format a fitted number with its interval and unit, or the bound that it is at.
-
-    The resulting value in the model file, and a value outside the usual range, are added.
-    """
-    text = append_unit(format_estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
-    if fitted.at_bound is not None:
-        text = at_bound(fitted.value, fitted.unit, fitted.at_bound)
-    return text + format_file_change(fitted) + format_plausible_range(fitted)
-
-
-def format_file_change(fitted: FittedValue) -> str:
-    """Format the change in the model file: ``, in the model file 0.2 → 0.15 N·m``; else empty."""
-    if fitted.stated is None or fitted.total is None:
-        return ""
-    total = append_unit(format_number(fitted.total), fitted.total_unit or fitted.unit)
-    return f", in the model file {format_number(fitted.stated)} → {total}"
-
-
-def format_plausible_range(fitted: FittedValue) -> str:
-    """Format the usual range of a value outside it: ``, beyond the usual range of 0 to 0.6 N``."""
-    if fitted.usual_range is None:
-        return ""
-    low, high = map(format_number, fitted.usual_range)
-    return f", beyond the usual range of {append_unit(f'{low} to {high}', fitted.unit)}"
-
-
-def at_bound(value: float, unit: str, bound: str) -> str:
-    """Format a value at a bound: ``4 s (upper bound of its range)``."""
-    return f"{append_unit(format_number(value), unit)} ({END[bound]} bound of its range)"
-
-
-MAX_NAMED_MEMBERS = 6
-"""Maximum number of members of a set that a sentence names; the remaining ones are counted."""
-DIFFERENCE_EFFECTS = frozenset(
-    {"drag.linear", "drag.quadratic", "friction.coulomb", "spring.linear"}
-)
-"""Effects whose coefficient is a difference from the value in the model file."""
+    effect_name, place = split_effect_name(effect)
+    if not place:
+        return format_effect_name(effect)
+    place_text = (
+        format_places(get_place_kind(effect), [place])
+        if place == ALL_PLACES
+        else f" at {sanitise(place, MAX_PLACE_CHARACTERS)}"
+    )
+    return format_effect_name(effect_name) + place_text
 
 
 def format_effect_set(names: Sequence[str], conjunction: str = "or") -> str:
@@ -311,6 +297,43 @@ def _format_effect_group(group: Sequence[str], conjunction: str) -> str:
     return text
 
 
+def describe_effect(causes: Sequence[Cause], name: str) -> str:
+    """Return the description of an effect as a sentence; for a cause, the one in the verdict.
+
+    It is empty for an effect that is not registered: one of a plugin that is not loaded, or a
+    numerical setting such as the time step.
+
+    Args:
+        causes: Causes of the verdict.
+        name: Name of the effect, with its place if it has one.
+    """
+    for cause in causes:
+        if cause.effect == name:
+            return format_sentence(strip_place(sanitise(cause.says, 400)))
+    base, place = split_effect_name(name)
+    try:
+        effect = effects.get_effect(base)
+    except InputError:
+        return ""
+    return format_sentence((effect.says_at_place if place else "") or effect.says)
+
+
+def strip_place(description: str) -> str:
+    """Remove the place in brackets from a description, because its noun names the place already."""
+    return re.sub(r" \(at [^()]*\)$", "", description)
+
+
+def format_causes(causes: Sequence[Cause]) -> str:
+    """Format the causes; those with alternatives come last.
+
+    For example ``wind, and linear drag or Coulomb friction``.
+    """
+    certain_names = [format_effect(cause.effect) for cause in causes if not cause.alternatives]
+    parts = [joined(certain_names)] if certain_names else []
+    parts += [format_effect_set([c.effect, *c.alternatives]) for c in causes if c.alternatives]
+    return ", and ".join(parts)
+
+
 def format_missing_causes(causes: Sequence[Cause], with_alternatives: bool = True) -> str:
     """Format what a simulation lacks and has wrong; causes with alternatives come last.
 
@@ -359,17 +382,6 @@ def names_parameter_error(causes: Sequence[Cause]) -> bool:
     )
 
 
-def format_causes(causes: Sequence[Cause]) -> str:
-    """Format the causes; those with alternatives come last.
-
-    For example ``wind, and linear drag or Coulomb friction``.
-    """
-    certain_names = [format_effect(cause.effect) for cause in causes if not cause.alternatives]
-    parts = [joined(certain_names)] if certain_names else []
-    parts += [format_effect_set([c.effect, *c.alternatives]) for c in causes if c.alternatives]
-    return ", and ".join(parts)
-
-
 def format_number_error(cause: Cause) -> str:
     """Format how wrong the model file is, as a clause; empty for causes that are no such error.
 
@@ -411,40 +423,35 @@ def is_overstated(cause: Cause) -> bool:
     return bool(place) and base in DIFFERENCE_EFFECTS and bool(values) and max(values) < 0
 
 
-_SHARE = "the {} {{place}} is {{percent}} {{larger}} than the model file states"
-_DIFFERENCE = "the {} {{place}} is {{size}} {{larger}} than the model file states"
-MODEL_FILE_ERRORS = {
-    "mass.scale": _SHARE.format("mass"),
-    "inertia.scale": _SHARE.format("inertia"),
-    "actuator.stiffness": _SHARE.format("stiffness"),
-    "actuator.damping": _SHARE.format("damping"),
-    "inertia.armature": _DIFFERENCE.format("armature"),
-    "mass.offset": "the centre of mass {place} is {distance} from where the model file has it",
-    "joint.zero": "the zero {place}, for commands and readings, is {size} from that of the model "
-    "file",
-    "joint.axis": "the axis {place} is tilted by {angle} from the model file",
-    "link.length": "the distance {place} from its parent is {percent} {larger} than the model file "
-    "states",
-    "geom.radius": _SHARE.format("radius"),
-    "contact.friction": _DIFFERENCE.format("friction coefficient"),
-    "contact.softness": _SHARE.format("time constant"),
-    "contact.damping": _SHARE.format("damping ratio"),
-}
-"""Clause on how wrong a value of the model file is, by effect.
+def format_cause_with_values(cause: Cause) -> str:
+    """Format a cause with its registered name, those of its alternatives, and its values.
 
-Its fields are the place; the first coefficient in per cent or with its unit; the length of all
-coefficients as a vector, with their unit or as an angle; and ``larger`` or ``smaller``.
-"""
-_STEP_ERROR_TEXTS = {
-    "numerics.step": "the time step of the model file is too long",
-    "numerics.integrator": "the integrator of the model file does not reproduce the recording",
-    "numerics.cone": "the model file has another friction cone",
-    "numerics.impratio": "the model file has another impedance ratio of friction",
-    "numerics.noslip": "the model file has another number of iterations without slip",
-    "numerics.solver": "the model file has another constraint solver",
-    "numerics.iterations": "the model file has another number of iterations of the solver",
-}
-"""Description of wrong numerical settings of the model file; the cause names the correction."""
+    For example ``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴)
+    N·s/m``.
+
+    Args:
+        cause: Cause with its coefficients.
+    """
+    effect_names = joined([cause.effect, *cause.alternatives], "or")
+    numbers = [
+        f"{name} {format_fitted_value(number)}" for name, number in cause.coefficients.items()
+    ]
+    return f"{effect_names}: {joined(numbers)}"
+
+
+def format_values(cause: Cause) -> str:
+    """Format the coefficients of a cause in one line.
+
+    If the cause is one effect at all joints or bodies (a family), each coefficient is followed by
+    the joint or body at which it acts.
+    """
+    texts = []
+    for name, text in list_values(cause):
+        coefficient, place = split_effect_name(name)
+        # The default name says nothing if the place identifies the coefficient.
+        prefix = "" if place and coefficient == "coefficient" else f"{coefficient} "
+        texts.append(f"{prefix}{text}" + (f" at {place}" if place else ""))
+    return joined(texts)
 
 
 def list_values(cause: Cause) -> list[tuple[str, str]]:
@@ -464,60 +471,16 @@ def list_values(cause: Cause) -> list[tuple[str, str]]:
     ]
 
 
-def format_values(cause: Cause) -> str:
-    """Format the coefficients of a cause in one line.
-
-    If the cause is one effect at all joints or bodies (a family), each coefficient is followed by
-    the joint or body at which it acts.
-    """
-    texts = []
-    for name, text in list_values(cause):
-        coefficient, place = split_effect_name(name)
-        # The default name says nothing if the place identifies the coefficient.
-        prefix = "" if place and coefficient == "coefficient" else f"{coefficient} "
-        texts.append(f"{prefix}{text}" + (f" at {place}" if place else ""))
-    return joined(texts)
-
-
-def strip_place(description: str) -> str:
-    """Remove the place in brackets from a description, because its noun names the place already."""
-    return re.sub(r" \(at [^()]*\)$", "", description)
-
-
-LONGEST_PLACE = 64
-"""Maximum number of characters of a place's name in a list."""
-
-
-def shorten_effect_name(effect: str) -> str:
-    """Format an effect for a list: without its article, and without the kind of its place.
-
-    Args:
-        effect: Name such as ``friction.coulomb@elbow``.
-
-    Returns:
-        Text such as "Coulomb friction at elbow".
-    """
-    effect_name, place = split_effect_name(effect)
-    if not place:
-        return format_effect_name(effect)
-    place_text = (
-        format_places(get_place_kind(effect), [place])
-        if place == ALL_PLACES
-        else f" at {sanitise(place, LONGEST_PLACE)}"
-    )
-    return format_effect_name(effect_name) + place_text
-
-
-def format_coefficient(cause: Cause, effect: str, place: str) -> str:
+def format_coefficient_label(cause: Cause, effect: str, place: str) -> str:
     """Format the coefficient of a cause at a place for a label, such as ``: +12 %``.
 
     The text is empty if the cause has several coefficients there. A relative change of a value of
     the model file is given in percent, others with their unit.
 
     Args:
-        cause: the cause with its coefficients.
-        effect: name of the effect, with its place.
-        place: place of the label, such as a joint.
+        cause: Cause with its coefficients.
+        effect: Name of the effect, with its place.
+        place: Place of the label, such as a joint.
     """
     at_place = []
     for name, fitted_value in cause.coefficients.items():
@@ -534,14 +497,72 @@ def format_coefficient(cause: Cause, effect: str, place: str) -> str:
     return f": {append_unit(format_number(fitted.value, 2), fitted.unit)}"
 
 
-def format_cause_with_values(cause: Cause) -> str:
-    """Format a cause, its alternatives and its numbers.
+def format_fitted_value(fitted: FittedValue) -> str:
+    """Format a fitted number with its interval and unit, or the bound that it is at.
 
-    For example ``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴)
-    N·s/m``.
+    The resulting value in the model file, and a value outside the usual range, are added.
     """
-    effects = joined([cause.effect, *cause.alternatives], "or")
-    numbers = [
-        f"{name} {format_fitted_value(number)}" for name, number in cause.coefficients.items()
-    ]
-    return f"{effects}: {joined(numbers)}"
+    text = append_unit(format_estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
+    if fitted.at_bound is not None:
+        text = format_value_at_bound(fitted.value, fitted.unit, fitted.at_bound)
+    return text + format_file_change(fitted) + format_plausible_range(fitted)
+
+
+def format_file_change(fitted: FittedValue) -> str:
+    """Format the change in the model file: ``, in the model file 0.2 → 0.15 N·m``; else empty."""
+    if fitted.stated is None or fitted.total is None:
+        return ""
+    total = append_unit(format_number(fitted.total), fitted.total_unit or fitted.unit)
+    return f", in the model file {format_number(fitted.stated)} → {total}"
+
+
+def format_plausible_range(fitted: FittedValue) -> str:
+    """Format the usual range of a value outside it: ``, beyond the usual range of 0 to 0.6 N``."""
+    if fitted.usual_range is None:
+        return ""
+    low, high = map(format_number, fitted.usual_range)
+    return f", beyond the usual range of {append_unit(f'{low} to {high}', fitted.unit)}"
+
+
+def format_value_at_bound(value: float, unit: str, bound: str) -> str:
+    """Format a value at a bound: ``4 s (upper bound of its range)``."""
+    return f"{append_unit(format_number(value), unit)} ({END_WORDS[bound]} bound of its range)"
+
+
+def format_sentence(text: object) -> str:
+    """Format text as a sentence, with a capital first letter and a final period.
+
+    Args:
+        text: Text of a file or of this project; control characters are removed.
+    """
+    sanitised_text = sanitise(text)
+    if not sanitised_text:
+        return sanitised_text
+    # A name with digits or underscores stays unchanged.
+    first_word, *_ = sanitised_text.split()
+    if first_word.rstrip(",:;.").isalpha():
+        sanitised_text = sanitised_text[0].upper() + sanitised_text[1:]
+    return sanitised_text if sanitised_text[-1] in ".!?…" else f"{sanitised_text}."
+
+
+def format_label(name: str, unit: str, max_length: int = 30) -> str:
+    """Format a label with its unit: ``q [rad]``, or ``q`` for a pure number.
+
+    Args:
+        name: Text of the label.
+        unit: Unit.
+        max_length: Maximum number of characters of the text.
+    """
+    label, unit_text = sanitise(name, max_length), format_unit(unit)
+    return f"{label} [{unit_text}]" if unit_text else label
+
+
+def shorten_label(name: object, unit: str = "1", max_length: int = 30) -> str:
+    """Format a text from a file, optionally with its unit, short enough for a label.
+
+    Args:
+        name: Text of the label.
+        unit: Unit; ``1`` for none.
+        max_length: Maximum number of characters of the text.
+    """
+    return format_label(sanitise(name, max_length), sanitise(unit, 12))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bench.diagnosis.report.cause_and_value_text import (
     ALL_PLACES,
     QUANTITY_LABELS,
-    format_coefficient,
+    format_coefficient_label,
     format_effect_name,
     get_place_kind,
     sanitise,
@@ -33,7 +33,7 @@ def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
             noun, kind = format_effect_name(base), get_place_kind(name)
             for place in _list_places(report, name, cause):
                 # The coefficients are those of the cause, not of its alternatives.
-                size = format_coefficient(cause, name, place) if name == cause.effect else ""
+                size = format_coefficient_label(cause, name, place) if name == cause.effect else ""
                 mark = PlaceMark(kind, place, f"{noun}{size}", is_certain)
                 # An effect at all places and one of its places give the same mark.
                 marks.setdefault((kind, place, noun), mark)

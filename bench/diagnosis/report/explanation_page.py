@@ -8,16 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from bench.diagnosis.report import cause_and_value_text, summary_text
+from bench.diagnosis.report import cause_and_value_text, residual_analysis, summary_text
 from bench.diagnosis.report.candidate_ranking import (
     BEST,
     build_candidate_table,
     has_placed_causes,
 )
-from bench.diagnosis.report.cause_and_value_text import (
-    format_label,
-    sanitise,
-)
+from bench.diagnosis.report.cause_and_value_text import format_label, sanitise
 from bench.diagnosis.report.consistency_section import (
     MAX_TABLE_ROWS,
     build_agreement_rows,
@@ -33,11 +30,7 @@ from bench.diagnosis.report.motion_chart import (
     MOTION_TABLE_NAME,
     make_motion_chart,
 )
-from bench.diagnosis.report.report_data import (
-    DiagnosisReportData,
-    ResidualProfile,
-)
-from bench.diagnosis.report.residual_analysis import compute_channel_errors
+from bench.diagnosis.report.report_data import DiagnosisReportData, ResidualProfile
 from bench.diagnosis.report.residual_figure import MAX_LABEL_LENGTH, select_informative_profiles
 from bench.diagnosis.validation.confidence_intervals import Z95
 from bench.figures.figure_output import FigureFiles
@@ -48,7 +41,77 @@ from bench.pages.interval_drawing import draw_intervals
 from bench.pages.page_table import Table
 
 CANDIDATE_TABLE, GAP_LOCATION_TABLE, RESIDUAL_PROFILE_TABLE = "candidates", "where", "follows"
-"""Names of the tables."""
+"""Names of the tables of the page."""
+_TEMPLATE = Path(__file__).with_name("explanation.html")
+_STYLE = Path(__file__).with_name("report.css")
+MAX_OPEN_CHANGES = 12
+"""Maximum number of changes of a model file that are shown unfolded."""
+
+
+def render_report(
+    report: DiagnosisReportData,
+    figures: Mapping[str, FigureFiles],
+    folder: Path | None = None,
+) -> str:
+    """Render the report as HTML.
+
+    The template (Jinja2) gets the report data, and the modules whose functions format them; tables
+    and charts are drawn by the script of the page.
+
+    Args:
+        report: Report data.
+        figures: Figures by name; missing ones are left out.
+        folder: Folder in which the report is written with the other files; None for a page alone.
+    """
+    page = HtmlPage(figures, _STYLE.read_text(encoding="utf-8"))
+    motion = make_motion_chart(report)
+    page.add_tables(
+        {
+            CANDIDATE_TABLE: build_candidate_table(report),
+            GAP_LOCATION_TABLE: build_gap_location_table(report),
+            RESIDUAL_PROFILE_TABLE: build_residual_profile_table(report),
+            MOTION_TABLE_NAME: motion.table.frame,
+        }
+    )
+    return page.render(
+        _TEMPLATE,
+        story=report,
+        folder=folder,
+        is_robot=is_robot(report),
+        has_places=has_placed_causes(report),
+        headline=summary_text.format_headline(report),
+        next_run=summary_text.format_next_run(report),
+        consistency=format_consistency(report),
+        marks=[
+            (find_joint(report, mark.kind, mark.name), mark) for mark in list_place_marks(report)
+        ],
+        joint_positions=figures["robot"].joint_positions if "robot" in figures else (),
+        motion=motion,
+        identifiability=build_identifiability_section(report),
+        profile_panels=make_residual_profile_panels(report),
+        less_informative=list_less_informative_profiles(report),
+        has_absorbed=any(
+            p.is_sensitive and summary_text.has_absorbed_gap(p) for p in report.parameters
+        ),
+        splits=[
+            (name, residual_analysis.compute_channel_errors(split).tolist())
+            for name, split in (
+                ("fitted", report.fitting),
+                (report.validation_run, report.held_out),
+            )
+            if split is not None and len(split.names)
+        ],
+        agreement=build_agreement_rows(report),
+        draw_intervals=draw_intervals,
+        BEST=BEST,
+        MAX_OPEN_CHANGES=MAX_OPEN_CHANGES,
+        MAX_TABLE_ROWS=MAX_TABLE_ROWS,
+        Z95=Z95,
+        pluralise_group=pluralise_group,
+        summary=summary_text,
+        residuals=residual_analysis,
+        wording=cause_and_value_text,
+    )
 
 
 def build_gap_location_table(report: DiagnosisReportData) -> Table:
@@ -158,75 +221,3 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
 
 def _format_profile_name(profile: ResidualProfile) -> str:
     return f"{sanitise(profile.channel, 80)} against {sanitise(profile.variable, 80)}"
-
-
-_TEMPLATE = Path(__file__).with_name("explanation.html")
-_STYLE = Path(__file__).with_name("report.css")
-MAX_OPEN_CHANGES = 12
-"""Maximum number of changes of a model file that are shown unfolded."""
-
-
-def render_report(
-    report: DiagnosisReportData,
-    figures: Mapping[str, FigureFiles],
-    folder: Path | None = None,
-) -> str:
-    """Render the report as HTML.
-
-    The template (Jinja2) gets the report data, and the modules whose functions format them; tables
-    and charts are drawn by the script of the page.
-
-    Args:
-        report: Report data.
-        figures: Figures by name; missing ones are left out.
-        folder: Folder in which the report is written with the other files; None for a page alone.
-    """
-    page = HtmlPage(figures, _STYLE.read_text(encoding="utf-8"))
-    motion = make_motion_chart(report)
-    page.add_tables(
-        {
-            CANDIDATE_TABLE: build_candidate_table(report),
-            GAP_LOCATION_TABLE: build_gap_location_table(report),
-            RESIDUAL_PROFILE_TABLE: build_residual_profile_table(report),
-            MOTION_TABLE_NAME: motion.table.frame,
-        }
-    )
-    return page.render(
-        _TEMPLATE,
-        story=report,
-        folder=folder,
-        is_robot=is_robot(report),
-        has_places=has_placed_causes(report),
-        headline=summary_text.format_headline(report),
-        next_run=summary_text.format_next_run(report),
-        consistency=format_consistency(report),
-        marks=[
-            (find_joint(report, mark.kind, mark.name), mark) for mark in list_place_marks(report)
-        ],
-        joint_positions=figures["robot"].joint_positions if "robot" in figures else (),
-        motion=motion,
-        identifiability=build_identifiability_section(report),
-        profile_panels=make_residual_profile_panels(report),
-        less_informative=list_less_informative_profiles(report),
-        has_absorbed=any(
-            p.is_sensitive and summary_text.has_absorbed_gap(p) for p in report.parameters
-        ),
-        splits=[
-            (name, compute_channel_errors(split).tolist())
-            for name, split in (
-                ("fitted", report.fitting),
-                (report.validation_run, report.held_out),
-            )
-            if split is not None and len(split.names)
-        ],
-        agreement=build_agreement_rows(report),
-        draw_intervals=draw_intervals,
-        BEST=BEST,
-        MAX_OPEN_CHANGES=MAX_OPEN_CHANGES,
-        MAX_TABLE_ROWS=MAX_TABLE_ROWS,
-        Z95=Z95,
-        pluralise_group=pluralise_group,
-        causes=cause_and_value_text,
-        summary=summary_text,
-        wording=cause_and_value_text,
-    )

@@ -1,10 +1,9 @@
-"""Report section on what the recording can identify, independent of the verdict.
+"""Report section and terminal text on what the recording can identify, independent of the verdict.
 
-It has a summary sentence, the free parameters, and a matrix of the causes; the full table is
-folded.
-
-A diagnosed cause counts as identifiable, whatever its score about the base model, and members of
-indistinguishable sets are marked. The section must not contradict the headline.
+The section has a summary sentence, the free parameters, and a matrix of the causes; the full table
+is folded. In it, a diagnosed cause counts as identifiable, whatever its score about the base model,
+and members of indistinguishable sets are marked. The section must not contradict the headline.
+The terminal text is for a recording that was not diagnosed (`simgap inspect`).
 """
 
 from __future__ import annotations
@@ -27,7 +26,11 @@ from bench.diagnosis.verdict import Cause
 from sims.core.user_messages import format_unit, join_first_names
 
 MAX_NAMED_CAUSES = 6
-"""Maximum number of names in a cell or list; the remaining ones are counted."""
+"""Maximum number of names in a cell or list of the page; the remaining ones are counted."""
+MAX_LISTED_CAUSES = 8
+"""Maximum number of causes with their own line, and of names in a list, in the terminal."""
+_LEVELS: tuple[IdentifiabilityLevel, ...] = ("identifiable", "weak", "not identifiable")
+"""Levels of identifiability, the most certain first."""
 _LEGEND = {
     "found": "★ named by the verdict",
     "set": "☆ explains the data as well as a named cause",
@@ -37,11 +40,6 @@ _LEGEND = {
 }
 """Sign and meaning of each status of a cause, the most certain first."""
 _STATUSES = tuple(_LEGEND)
-
-MAX_LISTED_CAUSES = 8
-"""Maximum number of causes with their own line, and of names in a list, in the terminal."""
-
-_WORDS: tuple[IdentifiabilityLevel, ...] = ("identifiable", "weak", "not identifiable")
 
 
 class CauseRow(NamedTuple):
@@ -229,11 +227,13 @@ def format_identifiability(assessments: Sequence[ParameterIdentifiability]) -> l
     """Format the free parameters and the best identifiable causes as lines for the terminal.
 
     Args:
-        assessments: identifiability of each free parameter, then of each cause, best first.
+        assessments: Identifiability of each free parameter, then of each cause, best first.
     """
     lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
     lines += [f"  {_format_parameter(number)}" for number in assessments if number.free]
-    causes = {level: [n for n in assessments if not n.free and n.word == level] for level in _WORDS}
+    causes = {
+        level: [n for n in assessments if not n.free and n.word == level] for level in _LEVELS
+    }
     counts = [f"{len(members)} {level}" for level, members in causes.items()]
     lines.append(f"causes, each considered alone, smallest uncertainty first: {', '.join(counts)}")
     # A limit has no interval, and follows the causes that have one.

@@ -1,4 +1,7 @@
-"""Differences between the user's model file and the extended one, for the report."""
+"""Differences between the user's model file and the extended one, for the report.
+
+Both files are split into elements, tags and comments, so that line breaks do not count.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,13 @@ MIN_UNCHANGED_SHARE = 0.5
 """Minimum share of unchanged elements; with fewer, the file counts as rewritten and old lines are
 not shown.
 """
-
 FITTED_COMMENT_MARKER = ", fitted to "
 """Text that marks comments about a cause."""
-
 _COMMENT = re.compile(r"<!--\s*(.*?)\s*-->")
-
-_PART = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
-
-_HEAD = re.compile(r"<(\w+)")
-
-_NAME = re.compile(r"\bname\s*=\s*[\"']([^\"']*)")
+_ELEMENT = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
+_TAG_NAME = re.compile(r"<(\w+)")
+_NAME_ATTRIBUTE = re.compile(r"\bname\s*=\s*[\"']([^\"']*)")
+"""Patterns of a comment, a tag or comment, the name of a tag, and its attribute `name`."""
 
 
 def find_model_file_changes(before: str, after: str) -> tuple[ModelFileChange, ...]:
@@ -50,7 +49,7 @@ def find_model_file_changes(before: str, after: str) -> tuple[ModelFileChange, .
 
 def _split_into_elements(text: str) -> list[str]:
     """Split the text into tags and comments, whatever the line breaks."""
-    return [" ".join(part.split()) for part in _PART.findall(text)]
+    return [" ".join(part.split()) for part in _ELEMENT.findall(text)]
 
 
 def _compare_blocks(old: Sequence[str], new: Sequence[str]) -> Iterator[ModelFileChange]:
@@ -102,5 +101,5 @@ def _pair_with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 def _format_element(line: str) -> str:
     """Format the element of a line of XML, such as ``joint elbow``."""
-    head, name = _HEAD.search(line), _NAME.search(line)
+    head, name = _TAG_NAME.search(line), _NAME_ATTRIBUTE.search(line)
     return " ".join(match[1] for match in (head, name) if match)

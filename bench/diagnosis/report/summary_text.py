@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Sequence
 from functools import cache
 from math import isclose, isfinite
 from pathlib import Path
@@ -12,25 +13,35 @@ from typing import Any
 import numpy as np
 
 from bench.diagnosis.evaluation.search_control import QUESTION_TEXTS, EarlyStop
-from bench.diagnosis.report import candidate_ranking, cause_and_value_text, detectable_gap
-from bench.diagnosis.report import cause_and_value_text as wording
+from bench.diagnosis.report import (
+    candidate_ranking,
+    cause_and_value_text,
+    detectable_gap,
+    residual_analysis,
+)
 from bench.diagnosis.report.cause_and_value_text import (
+    END_WORDS,
     append_unit,
-    at_bound,
+    format_effect_set,
     format_estimate,
     format_number,
     format_percent,
     format_sentence,
+    format_value_at_bound,
     sanitise,
 )
 from bench.diagnosis.report.consistency_section import format_consistency as format_consistency
 from bench.diagnosis.report.report_data import (
-    DataSplit,
     DiagnosisReportData,
     GapLocation,
     ParameterChange,
 )
-from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
+from bench.diagnosis.search.diagnose import DiagnosisResult
+from bench.diagnosis.search.lack_of_fit import LackOfFitResult
+from bench.diagnosis.search.verdict_rules import (
+    EFFECT_P_VALUE_THRESHOLD,
+    STRUCTURE_P_VALUE_THRESHOLD,
+)
 from bench.diagnosis.verdict import Cause, HeldOutResult
 from bench.pages.template import load_template
 from sims.core.root_mean_square import compute_rms
@@ -60,10 +71,10 @@ def _load_sentences() -> Any:
     return load_template(_TEMPLATE).make_module(
         {
             "summary": sys.modules[__name__],
-            "causes": cause_and_value_text,
             "ranking": candidate_ranking,
+            "residuals": residual_analysis,
             "gaps": detectable_gap,
-            "wording": wording,
+            "wording": cause_and_value_text,
             "MAX_SENTENCES_ON_PARAMETERS": MAX_SENTENCES_ON_PARAMETERS,
             "significance_level": EFFECT_P_VALUE_THRESHOLD,
         }
@@ -226,20 +237,6 @@ def get_held_out_unit(report: DiagnosisReportData) -> str:
     return units[0] if len(units) == 1 else "1"
 
 
-def compute_normalised_rms(report: DiagnosisReportData, split: DataSplit, model: str) -> float:
-    """Compute the RMS residual of a data split over all channels, in units of the noise.
-
-    Args:
-        report: Report data.
-        split: Data split.
-        model: ``before`` or ``after``.
-    """
-    sigma = np.array([c.sigma for c in report.channels])
-    residual = (split.observed - getattr(split, model)) / sigma
-    # The mean of an empty set would cause a warning.
-    return float(np.sqrt(np.nanmean(residual**2))) if np.isfinite(residual).any() else float("nan")
-
-
 def format_tuned_value(p: ParameterChange, model_index: int) -> str:
     """Format a parameter's estimate with its interval, or the bound that it is at.
 
@@ -253,7 +250,7 @@ def format_tuned_value(p: ParameterChange, model_index: int) -> str:
     bound = p.bounds[model_index]
     file_change = p.in_file if model_index == 1 else ""
     if bound is not None:
-        return at_bound(value, p.unit, bound) + file_change
+        return format_value_at_bound(value, p.unit, bound) + file_change
     return append_unit(format_estimate(value, low, high), p.unit) + file_change
 
 
@@ -310,3 +307,105 @@ def format_simulation_count(report: DiagnosisReportData) -> str:
     engine = sanitise(verdict.engine, 60)
     simulations = f"{verdict.simulations:,} simulations of system {system} on engine {engine}"
     return f"{simulations}, {format_number(verdict.seconds, 2)} s."
+
+
+def list_verdict_reasons(finding: DiagnosisResult) -> Iterator[str]:
+    """Yield the reasons for the verdict as sentences, the most important first.
+
+    A search that was stopped early has no such reasons.
+
+    Args:
+        finding: Outcome of the search: verdict, causes and lack of fit.
+    """
+    if finding.early_stop is not None:
+        return
+    if finding.verdict == "unknown" and finding.causes:
+        yield "the best effects do not close enough of the gap to explain it"
+    if finding.verdict in ("partial", "unknown") and finding.lack_of_fit.has_structure:
+        yield _describe_residual_structure(finding.lack_of_fit)
+    for cause in finding.causes:
+        if cause.alternatives:
+            names = [cause.effect, *cause.alternatives]
+            # Effects of a robot have a place, such as `friction.coulomb@elbow`.
+            have_places = any("@" in name for name in names)
+            effects_text = (
+                format_effect_set(names, "and") if have_places else _join_effect_names(names)
+            )
+            yield (
+                f"{effects_text} have the same influence on these runs, "
+                "once parameters and initial states are fitted with each: "
+                "their likelihoods differ by odds of less than 33 to 1"
+            )
+
+
+def _describe_residual_structure(lack_of_fit: LackOfFitResult) -> str:
+    """Say how the residual of the final model still differs from the noise of the sensors."""
+    p_value = lack_of_fit.p_value
+    # Lack of fit is either a residual with a pattern, or one that is only too large.
+    if p_value < STRUCTURE_P_VALUE_THRESHOLD:
+        return (
+            f"the residual has structure that sensor noise does not explain (p-value {p_value:.2g})"
+        )
+    return "the residual exceeds the stated noise of the sensors"
+
+
+def _join_effect_names(effects: list[str]) -> str:
+    """Join registered names of effects."""
+    return f"{effects[0]} and {', '.join(effects[1:])}"
+
+
+def list_bound_warnings(changes: Sequence[ParameterChange]) -> Iterator[str]:
+    """Yield a warning for each base parameter whose fitted value is at a bound of its range.
+
+    The value may then be wrong, and a cause may compensate for it. There are two fits, that of the
+    base model and that of the model with the causes. Of a parameter that is at a bound in both,
+    only the base fit is reported.
+
+    Args:
+        changes: Value, interval and bound of each parameter in both fits.
+    """
+    for parameter in changes:
+        (value_before, *_), (value_after, *_) = parameter.before, parameter.after
+        values = value_before, value_after
+        for fit_text, value, bound in zip(
+            ("in the base fit ", ""), values, parameter.bounds, strict=True
+        ):
+            if bound is None:
+                continue
+            yield (
+                f"{fit_text}{parameter.name} lies at the {END_WORDS[bound]} bound of its range, "
+                f"{value:g} {parameter.unit}: larger ranges were not searched, and a "
+                "cause may compensate for a value beyond the bound. Check the "
+                "units and constants of the recording"
+            )
+            # The second fit is not reported in addition.
+            break
+
+
+def list_unexplained_residuals(
+    lack_of_fit: LackOfFitResult, channels: Sequence[str], insensitive: str, unidentified: str
+) -> Iterator[str]:
+    """Yield sentences on the residual of the extended model, and on parameters kept nominal.
+
+    These are channels above the noise, the dependence of an unmodelled force, and parameters that
+    the data do not identify.
+
+    Args:
+        lack_of_fit: Result of the lack-of-fit test of the extended model.
+        channels: Names of all channels.
+        insensitive: Joined names of the parameters to which the data are insensitive.
+        unidentified: Joined names of those that are not identified together with the others.
+    """
+    for channel in lack_of_fit.channels_above_noise:
+        noise_multiple = lack_of_fit.excess[channels.index(channel)]
+        yield f"the residual of channel {channel} is {noise_multiple:.3g} times its noise"
+    # Without a result of the test for unmodelled forces there is no dependence to report.
+    if lack_of_fit.has_structure and lack_of_fit.where:
+        yield f"the residual behaves like a force that depends on {lack_of_fit.where}"
+    if insensitive:
+        yield f"the data do not depend on {insensitive}: kept at the nominal value"
+    if unidentified:
+        yield (
+            f"the data do not identify {unidentified} together with the other parameters: kept at "
+            "the nominal value"
+        )

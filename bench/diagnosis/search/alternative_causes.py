@@ -18,13 +18,12 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.fitting.fitted_models import FittedModel, select_likeliest
-from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.search.effect_search import (
     FAR_EXCESS,
     MAX_RICHER_LAW_EXCESS_RATIO,
     EffectSearch,
 )
-from bench.diagnosis.search.fit_starts import generate_shifted_starts
+from bench.diagnosis.search.fit_starts import generate_shifted_starts, make_swapped_start
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
 from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.score_test import estimate_tail_p_value
@@ -98,7 +97,7 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     starts = [candidate.fit.make_start() for candidate in competing_models]
     starts += [candidate.fit.make_start() for candidate in submodels]
     starts += [
-        _make_swapped_start(search, model, candidate)
+        make_swapped_start(search.evaluator, model, candidate)
         for candidate in compared_models
         if len(model.effects) > 1 and differ_in_one_effect(model, candidate)
     ]
@@ -142,31 +141,6 @@ def differ_in_one_effect(model: FittedModel, other_model: FittedModel) -> bool:
     """Return whether models have as many effects, and all in common except one of each."""
     has_same_size = len(model.effects) == len(other_model.effects)
     return has_same_size and len(set(model.effects) - set(other_model.effects)) == 1
-
-
-def _make_swapped_start(
-    search: EffectSearch, model: FittedModel, other_model: FittedModel
-) -> FitStart:
-    """Return a start for a competing model, with all shared effects at the values of the model.
-
-    The models differ in one effect, whose coefficients are those of the competing model. A law with
-    several coefficients converges to slightly different values each time, which would make
-    equivalent models look different.
-
-    Args:
-        search: the search, which has the position of each effect in the parameters theta.
-        model: fitted model, whose base parameters, shared effects and initial states are used.
-        other_model: fitted competing model, in which one effect of `model` is replaced.
-    """
-    (added_effect,) = set(other_model.effects) - set(model.effects)
-    (removed_effect,) = set(model.effects) - set(other_model.effects)
-    coefficient_slices = search.evaluator.coefficient_slices
-    added = coefficient_slices[added_effect]
-    theta = model.fit.theta.copy()
-    # Zero coefficients switch an effect off.
-    theta[coefficient_slices[removed_effect]] = 0.0
-    theta[added] = other_model.fit.theta[added]
-    return FitStart(other_model.effects, theta, model.fit.initial_states)
 
 
 def list_competing_models(search: EffectSearch, model: FittedModel) -> list[FittedModel]:

@@ -11,6 +11,9 @@ With y(c) the simulated runs at coefficients c, the direction of a scaling coeff
 
 at a c so small that y is linear in it. If an effect has no such c (a limit changes nothing until
 the input reaches it), the direction is the whole change at one size, and is valid only there.
+
+The coefficients at which a response is computed are called a probe (`CandidateDirection`). The
+runs of a robot without contacts are not simulated for it: their linearised dynamics are used.
 """
 
 from __future__ import annotations
@@ -146,6 +149,30 @@ def compute_directions(
         )
     # The probes become the last axis.
     return DirectionSet(tuple(probes), np.moveaxis(responses, 0, -1))
+
+
+def list_probes(
+    evaluator: RunEvaluator, model_effects: Sequence[str], names: Sequence[str]
+) -> list[CandidateDirection]:
+    """Return trial coefficients (probes) of effects, whose responses are regressors.
+
+    An effect has a probe for each of its coefficients in which it is linear, and these for each of
+    its shapes, for example for each period of a periodic force.
+
+    Args:
+        evaluator: the runs.
+        model_effects: names of the effects that the model contains.
+        names: names of the candidates.
+    """
+    probes: list[CandidateDirection] = []
+    for name in names:
+        bounds = compute_coefficient_bounds(evaluator, name)
+        for probe in iterate_first_probes(evaluator, model_effects, name):
+            # The value in the model file may be too large, so the correction may be negative.
+            low, _ = bounds[probe.coefficient_index]
+            can_be_negative = probe.can_be_negative or (low < 0 and not probe.is_single_size)
+            probes.append(replace(probe, can_be_negative=can_be_negative))
+    return probes
 
 
 def iterate_first_probes(
@@ -646,42 +673,10 @@ def compute_responses(
         Changes (K, R, T, C).
     """
     if evaluator.has_linearisation:
-        # Imported here, because only robots need it.
-
         return compute_effect_responses(evaluator, fit.theta, fit.initial_states, added)
     values = simulate_with_effect(evaluator, fit, added)
     values -= fit.simulated
     return values
-
-
-def simulate_with_effect(
-    evaluator: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
-) -> Array:
-    """Simulate the runs of a fitted model with one added effect, for each of K effects.
-
-    Shapes: R runs, T samples, C channels.
-
-    Args:
-        evaluator: evaluator that simulates the recorded runs.
-        fit: fit of the model without these effects.
-        added: K effects with their coefficients.
-
-    Returns:
-        Observations (K, R, T, C).
-    """
-    run_count = len(evaluator.prepared_runs)
-    # One row of parameters for each effect.
-    theta = np.tile(fit.theta, (len(added), 1))
-    for row, (name, coefficients) in zip(theta, added, strict=True):
-        row[evaluator.coefficient_slices[name]] = coefficients
-    # All candidates and runs are simulated in one engine call, as one batch.
-    effect_count = len(added)
-    simulated = evaluator.simulate(
-        theta=np.repeat(theta, run_count, axis=0),
-        runs=np.tile(np.arange(run_count), effect_count),
-        states=np.tile(fit.initial_states, (effect_count, 1)),
-    )
-    return simulated.reshape(effect_count, run_count, *simulated.shape[1:])
 
 
 def compute_effect_responses(
@@ -717,7 +712,7 @@ def compute_effect_responses(
         (run, theta, states[run], [added[i] for i in missing_indices]) for run in range(runs)
     ]
     for run, (values, simulation_count) in evaluator.worker_pool.map_unordered(
-        evaluator, _compute_responses, worker_arguments
+        evaluator, _compute_responses_of_run, worker_arguments
     ):
         # Values that overflow single precision become infinite here.
         with np.errstate(over="ignore"):
@@ -734,7 +729,7 @@ def compute_effect_responses(
     return responses
 
 
-def _compute_responses(
+def _compute_responses_of_run(
     evaluator: RunEvaluator,
     run: int,
     theta: Array,
@@ -761,25 +756,31 @@ def _compute_responses(
     )
 
 
-def list_probes(
-    evaluator: RunEvaluator, model_effects: Sequence[str], names: Sequence[str]
-) -> list[CandidateDirection]:
-    """Return small trial coefficients (probes) of effects; their responses are regressors.
+def simulate_with_effect(
+    evaluator: RunEvaluator, fit: TrajectoryFit, added: Sequence[tuple[str, Array]]
+) -> Array:
+    """Simulate the runs of a fitted model with one added effect, for each of K effects.
 
-    An effect has a probe for each of its coefficients in which it is linear, and these for each of
-    its shapes, for example for each period of a periodic force.
+    Shapes: R runs, T samples, C channels.
 
     Args:
-        evaluator: the runs.
-        model_effects: names of the effects that the model contains.
-        names: names of the candidates.
+        evaluator: evaluator that simulates the recorded runs.
+        fit: fit of the model without these effects.
+        added: K effects with their coefficients.
+
+    Returns:
+        Observations (K, R, T, C).
     """
-    probes: list[CandidateDirection] = []
-    for name in names:
-        bounds = compute_coefficient_bounds(evaluator, name)
-        for probe in iterate_first_probes(evaluator, model_effects, name):
-            # The value in the model file may be too large, so the correction may be negative.
-            low, _ = bounds[probe.coefficient_index]
-            can_be_negative = probe.can_be_negative or (low < 0 and not probe.is_single_size)
-            probes.append(replace(probe, can_be_negative=can_be_negative))
-    return probes
+    run_count = len(evaluator.prepared_runs)
+    # One row of parameters for each effect.
+    theta = np.tile(fit.theta, (len(added), 1))
+    for row, (name, coefficients) in zip(theta, added, strict=True):
+        row[evaluator.coefficient_slices[name]] = coefficients
+    # All candidates and runs are simulated in one engine call, as one batch.
+    effect_count = len(added)
+    simulated = evaluator.simulate(
+        theta=np.repeat(theta, run_count, axis=0),
+        runs=np.tile(np.arange(run_count), effect_count),
+        states=np.tile(fit.initial_states, (effect_count, 1)),
+    )
+    return simulated.reshape(effect_count, run_count, *simulated.shape[1:])

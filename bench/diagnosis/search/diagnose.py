@@ -195,7 +195,7 @@ class Diagnosis:
         if self._search_control.has_abandoned_fits():
             raise SearchStoppedError
         # Without motion, residual tests would only test rounding.
-        if is_motionless(search):
+        if _shows_no_motion(search):
             return _build_motionless_result(search)
         base = search.base_model
         unidentified = find_unidentified_parameters(search, base)
@@ -312,7 +312,7 @@ class Diagnosis:
         )
 
 
-def is_motionless(search: EffectSearch) -> bool:
+def _shows_no_motion(search: EffectSearch) -> bool:
     """Return whether the recording shows no motion, and the base model expects none.
 
     Without motion the residual is only rounding, so the diagnosis ends before the search. The

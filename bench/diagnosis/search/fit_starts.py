@@ -1,7 +1,9 @@
-"""Starts of fits with one more effect: high-scoring effects, and several initial coefficients.
+"""Starts of fits: with one more effect, with other effects, coefficients or initial states.
 
-Least squares finds only the nearest local minimum. End stops, frequencies and event times have many
-of them, so that their fits start from several values.
+Effects with high scores are added to a fitted model (`select_refit_starts`). Least squares finds
+only the nearest local minimum. End stops, frequencies and event times have many of them, so that
+their fits start from several values. Other starts add, replace, swap or scale an effect of a model,
+or have better initial states.
 """
 
 from __future__ import annotations
@@ -232,36 +234,6 @@ def _rank_candidates(
         i for i in ranked if i in simulated_candidates and score_excess[i] >= best_excess
     ]
     return selected + by_simulation[:MAX_REFITS_BY_SIMULATION]
-
-
-def add_effect_to_start(
-    evaluator: RunEvaluator, start: FitStart, name: str, coefficients: Array
-) -> FitStart:
-    """Add an effect to the start of a fit, in place of the simpler effects that it contains.
-
-    Both together would have no unique solution: Stribeck friction, for example, contains Coulomb
-    friction. What the simpler effects did is added to the coefficients of the new one, and their
-    own coefficients become zero.
-
-    Args:
-        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-        start: start of a fit of the model without the effect.
-        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-        coefficients: (k,) coefficients of the effect.
-
-    Returns:
-        Start of a fit, with the effect last.
-    """
-    effect = evaluator.available_effects[name]
-    theta = start.theta.copy()
-    for simpler_effect in sorted(set(effect.contains) & set(start.effects)):
-        simpler_slice = evaluator.coefficient_slices[simpler_effect]
-        # Coefficients with which the effect also does what the simpler one did.
-        coefficients = effect.taking(coefficients, simpler_effect, theta[simpler_slice])
-        theta[simpler_slice] = 0.0
-    theta[evaluator.coefficient_slices[name]] = coefficients
-    remaining_effects = [n for n in start.effects if n not in effect.contains]
-    return FitStart((*remaining_effects, name), theta, start.initial_states)
 
 
 def _predict_jacobian(
@@ -573,6 +545,102 @@ def _shift_frequency_or_time(
             yield 1.0 / max(frequency, lowest_frequency)
 
 
+def add_effect_to_start(
+    evaluator: RunEvaluator, start: FitStart, name: str, coefficients: Array
+) -> FitStart:
+    """Add an effect to the start of a fit, in place of the simpler effects that it contains.
+
+    Both together would have no unique solution: Stribeck friction, for example, contains Coulomb
+    friction. What the simpler effects did is added to the coefficients of the new one, and their
+    own coefficients become zero.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
+        start: start of a fit of the model without the effect.
+        name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
+        coefficients: (k,) coefficients of the effect.
+
+    Returns:
+        Start of a fit, with the effect last.
+    """
+    effect = evaluator.available_effects[name]
+    theta = start.theta.copy()
+    for simpler_effect in sorted(set(effect.contains) & set(start.effects)):
+        simpler_slice = evaluator.coefficient_slices[simpler_effect]
+        # Coefficients with which the effect also does what the simpler one did.
+        coefficients = effect.taking(coefficients, simpler_effect, theta[simpler_slice])
+        theta[simpler_slice] = 0.0
+    theta[evaluator.coefficient_slices[name]] = coefficients
+    remaining_effects = [n for n in start.effects if n not in effect.contains]
+    return FitStart((*remaining_effects, name), theta, start.initial_states)
+
+
+def make_replacing_start(
+    evaluator: RunEvaluator,
+    model: FittedModel,
+    removed_effects: Sequence[str],
+    new_effect: str,
+    coefficients: Array,
+) -> FitStart:
+    """Return a start of a fit in which one effect replaces several others of a model.
+
+    All other parameters and the first states are those of the model.
+
+    Args:
+        evaluator: the runs.
+        model: the fitted model.
+        removed_effects: effects that are removed.
+        new_effect: the effect that replaces them.
+        coefficients: (k,) coefficients of the new effect.
+    """
+    theta = model.fit.theta.copy()
+    for name in removed_effects:
+        theta[evaluator.coefficient_slices[name]] = 0.0
+    theta[evaluator.coefficient_slices[new_effect]] = coefficients
+    remaining = (name for name in model.effects if name not in removed_effects)
+    return FitStart((*remaining, new_effect), theta, model.fit.initial_states)
+
+
+def make_swapped_start(
+    evaluator: RunEvaluator, model: FittedModel, other_model: FittedModel
+) -> FitStart:
+    """Return a start for a competing model, with all shared effects at the values of the model.
+
+    The models differ in one effect, whose coefficients are those of the competing model. A law with
+    several coefficients converges to slightly different values each time, which would make
+    equivalent models look different.
+
+    Args:
+        evaluator: the runs, with the position of each effect in the parameters theta.
+        model: fitted model, whose base parameters, shared effects and initial states are used.
+        other_model: fitted competing model, in which one effect of `model` is replaced.
+    """
+    (added_effect,) = set(other_model.effects) - set(model.effects)
+    (removed_effect,) = set(model.effects) - set(other_model.effects)
+    added = evaluator.coefficient_slices[added_effect]
+    theta = model.fit.theta.copy()
+    # Zero coefficients switch an effect off.
+    theta[evaluator.coefficient_slices[removed_effect]] = 0.0
+    theta[added] = other_model.fit.theta[added]
+    return FitStart(other_model.effects, theta, model.fit.initial_states)
+
+
+def scale_effect(evaluator: RunEvaluator, start: FitStart, name: str, factor: float) -> FitStart:
+    """Return a start with the one coefficient of an effect scaled, within its bounds.
+
+    Args:
+        evaluator: the runs, with the bounds of the coefficient.
+        start: the start; it is not changed.
+        name: name of the effect.
+        factor: factor of its coefficient.
+    """
+    theta = start.theta.copy()
+    (index,) = evaluator.get_coefficient_indices(name)
+    ((low, high),) = compute_coefficient_bounds(evaluator, name)
+    theta[index] = np.clip(factor * theta[index], low, high)
+    return replace(start, theta=theta)
+
+
 def find_first_states(
     evaluator: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit
 ) -> FitStart | None:
@@ -601,29 +669,3 @@ def find_first_states(
     if not squares[runs.seen].sum() < fit.cost - MIN_SQUARES_DECREASE:
         return None
     return replace(fit.make_start(), initial_states=prediction.states)
-
-
-def make_replacing_start(
-    evaluator: RunEvaluator,
-    model: FittedModel,
-    removed_effects: Sequence[str],
-    new_effect: str,
-    coefficients: Array,
-) -> FitStart:
-    """Return a start of a fit in which one effect replaces several others of a model.
-
-    All other parameters and the first states are those of the model.
-
-    Args:
-        evaluator: the runs.
-        model: the fitted model.
-        removed_effects: effects that are removed.
-        new_effect: the effect that replaces them.
-        coefficients: (k,) coefficients of the new effect.
-    """
-    theta = model.fit.theta.copy()
-    for name in removed_effects:
-        theta[evaluator.coefficient_slices[name]] = 0.0
-    theta[evaluator.coefficient_slices[new_effect]] = coefficients
-    remaining = (name for name in model.effects if name not in removed_effects)
-    return FitStart((*remaining, new_effect), theta, model.fit.initial_states)

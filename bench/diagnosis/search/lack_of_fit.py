@@ -15,10 +15,7 @@ A hat of width w around a centre m of a variable z (time, position or speed) is 
     f(z) = c max(1 - |z - m| / w, 0) d                                                         (1)
 
 with direction d. Neighbouring hats overlap by half, so the sum of a family over one variable is any
-piecewise linear force with `HAT_COUNT` knots. If sigma is estimated from n samples of AR(1) noise
-with correlation phi, its relative standard error is (formula of M. S. Bartlett, 1946, at lag 0)
-
-    sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n))                                (2)
+piecewise linear force with `HAT_COUNT` knots.
 """
 
 from __future__ import annotations
@@ -30,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.diagnosis.evaluation.autoregressive_surrogates import draw_surrogates
+from bench.diagnosis.evaluation.noise_model import compute_sigma_standard_error
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import FittedModel, ModelSet
 from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
@@ -300,30 +298,13 @@ def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResul
     excess = residual_sigma / models.noise.sigma
     channels = []
     for channel_index, name in enumerate(models.evaluator.channels):
-        error = _compute_sigma_standard_error(models, model, channel_index)
+        error = compute_sigma_standard_error(
+            float(model.likelihood.phi[channel_index]),
+            int(models.observed_mask[:, :, channel_index].sum()),
+        )
         if exceeds_noise(excess[channel_index], error, models.is_noise_stated[channel_index]):
             channels.append(name)
     return LackOfFitResult(1.0, "", excess, tuple(channels))
-
-
-def _compute_sigma_standard_error(models: ModelSet, model: FittedModel, channel: int) -> float:
-    """Return the relative standard error of the estimated noise of a channel.
-
-    The residual of the channel must exceed the noise by a multiple of this error to count as too
-    large. For n samples of AR(1) noise with correlation phi it is, by eq. (2) of the module
-    docstring, sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n)).
-
-    Args:
-        models: the models, with the mask of recorded samples.
-        model: model whose residual shows the correlation of the noise.
-        channel: index of the channel.
-    """
-    # At a correlation of one, the formula diverges, and no channel would exceed its noise.
-    phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
-    # A channel may have no samples, and must not be divided by zero.
-    sample_count = max(int(models.observed_mask[:, :, channel].sum()), 2)
-    relative_variance = (1.0 + phi * phi) / (1.0 - phi * phi) / (2.0 * sample_count)
-    return float(np.sqrt(relative_variance))  # (2)
 
 
 def compute_hat_directions(evaluator: RunEvaluator, model: FittedModel) -> DirectionSet:

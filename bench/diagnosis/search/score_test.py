@@ -45,6 +45,7 @@ from bench.diagnosis.evaluation.noise_model import (
 )
 from bench.diagnosis.evaluation.run_evaluator import Indices
 from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
+from bench.diagnosis.fitting.trajectory_derivatives import CandidateDirection
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.whitened_products import RANK_TOLERANCE, InnerProducts, WhiteningDesign
 from sims.core.simulator import Array
@@ -83,25 +84,26 @@ class GroupBatch:
     positive: tuple[bool, ...]
 
 
-def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
-    """Group the directions that can only be scored together.
+def group_probes(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
+    """Group the probes of one effect at one grid point, whose directions are scored together.
 
-    A direction is the response of the runs to one coefficient of an effect. A group has those of
-    one effect at one choice of its shape parameters (a grid point), such as the sine and the cosine
-    of a ripple of one frequency.
+    A direction is the response of the runs to one coefficient of an effect. A grid point is one
+    choice of the shape parameters of the effect, such as one frequency. The probes of a group
+    differ in the coefficient that scales them, such as the sine and the cosine of a ripple.
 
     Args:
-        directions: directions of all candidate effects.
+        probes: probes of all candidate effects. The index of a column of a group is that of its
+            probe.
     """
     columns_by_grid_point: dict[tuple[str, int], list[int]] = {}
-    for i, probe in enumerate(directions.candidates):
+    for i, probe in enumerate(probes):
         columns_by_grid_point.setdefault((probe.effect, probe.grid_point), []).append(i)
-    groups = []
-    for (effect, _), columns in columns_by_grid_point.items():
-        probes = [directions.candidates[i] for i in columns]
-        positive = tuple(not probe.can_be_negative for probe in probes)
-        groups.append(DirectionGroup(effect, tuple(columns), positive))
-    return groups
+    return [
+        DirectionGroup(
+            effect, tuple(columns), tuple(not probes[i].can_be_negative for i in columns)
+        )
+        for (effect, _), columns in columns_by_grid_point.items()
+    ]
 
 
 def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
@@ -368,7 +370,7 @@ class ScoreTest:
             observed_mask: (R, T, C) mask of available samples.
             noise: its sigma weights the channels; its correlation is not used.
         """
-        self._groups = group_directions(directions)
+        self._groups = group_probes(directions.candidates)
         self._batches = batch_groups(self._groups)
         self._count = int(observed_mask.sum())
         blocks = [batch.columns for batch in self._batches]

@@ -533,6 +533,24 @@ class ScoredModelSet(ModelSet):
         )
 
 
+def list_submodels(search: ScoredModelSet, model: FittedModel) -> list[FittedModel]:
+    """Return the fitted models that have all effects of a model except one.
+
+    From each of them, the gain of the missing effect is measured.
+
+    Args:
+        search: the search, with all fitted models.
+        model: the model with all effects.
+    """
+    names = set(model.effects)
+    size = len(names) - 1
+    submodels = []
+    for other_model in search.models.values():
+        if len(other_model.effects) == size and set(other_model.effects) < names:
+            submodels.append(other_model)
+    return submodels
+
+
 def _scan_model(
     evaluator: RunEvaluator,
     fit: TrajectoryFit,
@@ -594,21 +612,3 @@ def _score_residual(
         ),
         SURROGATE_COUNT,
     )
-
-
-def list_submodels(search: ScoredModelSet, model: FittedModel) -> list[FittedModel]:
-    """Return the fitted models that have all effects of a model except one.
-
-    From each of them, the gain of the missing effect is measured.
-
-    Args:
-        search: the search, with all fitted models.
-        model: the model with all effects.
-    """
-    names = set(model.effects)
-    size = len(names) - 1
-    submodels = []
-    for other_model in search.models.values():
-        if len(other_model.effects) == size and set(other_model.effects) < names:
-            submodels.append(other_model)
-    return submodels

@@ -26,53 +26,13 @@ from bench.diagnosis.search.effect_search import (
     select_by_size,
 )
 from bench.diagnosis.search.scored_models import list_submodels
-from bench.logs.sample_thinning import keeps_samples, take_every_nth
+from bench.logs.sample_thinning import has_enough_samples, take_every_nth
 from sims.recording.recording import Run
 
 MIN_SAMPLES_TO_THIN = 5_000
 """Minimum total number of samples of all runs for which they are thinned."""
 MIN_THINNED_SAMPLES = 2_000
 """Minimum total number of samples after thinning."""
-
-
-def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
-    """Return a run evaluator with fewer samples and the same parameters, for a faster search.
-
-    Recordings with many samples in each step of the engine lose little information.
-
-    Args:
-        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
-
-    Returns:
-        The thinned runs, or None if there are few samples, if the sample interval is already as
-        long as an engine step, or if a channel would lose too many samples.
-    """
-    total = int(evaluator.lengths.sum())
-    # Of each run, every n-th sample is kept; n is its factor.
-    max_factor = total // MIN_THINNED_SAMPLES
-    factors = [min(_compute_factor(run), max_factor) for run in evaluator.runs]
-    if total < MIN_SAMPLES_TO_THIN or max(factors) < 2:
-        return None
-    runs = [
-        take_every_nth(run, factor) for run, factor in zip(evaluator.runs, factors, strict=True)
-    ]
-    if not all(
-        keeps_samples(thinned_run, run, factor)
-        for thinned_run, run, factor in zip(runs, evaluator.runs, factors, strict=True)
-    ):
-        return None
-    return evaluator.with_runs(runs)
-
-
-def _compute_factor(run: Run) -> int:
-    """Return the number of sample intervals within one step of the simulator, at least 1."""
-    intervals = np.diff(run.times)
-    if not intervals.size:
-        return 1
-    # The small addend keeps rounding from reducing a whole number of intervals by one.
-    return max(int(MAX_TIME_STEP / float(np.median(intervals)) + 1e-6), 1)
-
-
 MAX_SINGLE_EFFECT_REFITS = 6
 """Number of best single-effect models that are fitted to all samples in addition."""
 
@@ -101,6 +61,44 @@ def search_with_subsampling(search: EffectSearch) -> FittedModel:
         return _search_subsampled(search, thinned_runs)
     finally:
         thinned_runs.close()
+
+
+def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
+    """Return a run evaluator with fewer samples and the same parameters, for a faster search.
+
+    Recordings with many samples in each step of the engine lose little information.
+
+    Args:
+        evaluator: evaluator that simulates the recorded runs for any parameters and effects.
+
+    Returns:
+        The thinned runs, or None if there are few samples, if the sample interval is already as
+        long as an engine step, or if a channel would lose too many samples.
+    """
+    total = int(evaluator.lengths.sum())
+    # Of each run, every n-th sample is kept; n is its factor.
+    max_factor = total // MIN_THINNED_SAMPLES
+    factors = [min(_compute_factor(run), max_factor) for run in evaluator.runs]
+    if total < MIN_SAMPLES_TO_THIN or max(factors) < 2:
+        return None
+    runs = [
+        take_every_nth(run, factor) for run, factor in zip(evaluator.runs, factors, strict=True)
+    ]
+    if not all(
+        has_enough_samples(thinned_run, run, factor)
+        for thinned_run, run, factor in zip(runs, evaluator.runs, factors, strict=True)
+    ):
+        return None
+    return evaluator.with_runs(runs)
+
+
+def _compute_factor(run: Run) -> int:
+    """Return the number of sample intervals within one step of the simulator, at least 1."""
+    intervals = np.diff(run.times)
+    if not intervals.size:
+        return 1
+    # The small addend keeps rounding from reducing a whole number of intervals by one.
+    return max(int(MAX_TIME_STEP / float(np.median(intervals)) + 1e-6), 1)
 
 
 def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> FittedModel:

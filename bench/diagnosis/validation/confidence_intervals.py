@@ -33,9 +33,7 @@ from bench.diagnosis.fitting.levenberg_marquardt import (
     compute_schur_complement,
     hold_known_states,
 )
-from bench.diagnosis.fitting.trajectory_derivatives import (
-    compute_central_jacobian,
-)
+from bench.diagnosis.fitting.trajectory_derivatives import compute_central_jacobian
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from sims.core.simulator import Array
 

@@ -18,6 +18,7 @@ from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, maximise_li
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fitted_models import count_identified_states
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
@@ -41,6 +42,8 @@ the initial states are computed again.
 MIN_SQUARES_DECREASE = 3.0
 """Minimum decrease of the sum of squares, in noise variances, by fresh derivatives, for which the
 fits are repeated with derivatives that are computed again before each stage.
+
+Better initial states of the fitted runs must gain as much (`search.fit_starts.find_first_states`).
 """
 REFIT_SQUARES_RATIO = 2.0
 """Ratio of a model's sum of squares to that of the nearest model from which it is refitted on the
@@ -328,9 +331,6 @@ class HeldOutRuns(Validation):
             fits: fit of each model.
             stages: share of the runs and maximum number of iterations, one after another.
         """
-        # This import is needed for robots only.
-        from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobian
-
         nearest_fit = _find_lowest_cost_fit(fits)
         compute_state_jacobian(
             self.evaluator, nearest_fit.theta, nearest_fit.initial_states, is_recomputed=True

@@ -64,11 +64,24 @@ from sims.recording.recording import Run
 CovariateKind = Literal[
     "load", "supply", "amplitude", "speed", "direction", "position", "command", "time", "other"
 ]
-
 LOAD_UNITS = ("kg", "kg*m^2", "N", "N*m")
 """Units by which a constant is recognised as a load."""
 MIN_RELATIVE_VARIATION = 1e-3
 """Minimum variation of a covariate between runs, as a fraction of its largest magnitude."""
+SIGNIFICANCE_LEVEL = 0.01
+"""Significance level of test (3), divided by the number of tests for all parameters together."""
+MIN_RELEVANT_SCATTER = 1e-3
+"""Scatter below which groups count as consistent at any p-value, as a fraction of the value."""
+MIN_GROUPS_FOR_TREND = 4
+"""Minimum number of groups for which a trend covariate is searched."""
+COVARIATE_TIE_FACTOR = 2.0
+"""Maximum ratio of the mean square about the line to the smallest one, for a covariate that counts
+as indistinguishable from the best.
+"""
+MAX_INTERVAL_WIDTH = 4.0
+"""Maximum width of a group's 95 % interval, as a multiple of the parameter's range or value, for
+the group to be used.
+"""
 
 
 class RunCovariate(NamedTuple):
@@ -185,22 +198,6 @@ def _varies_between_runs(values: Array) -> bool:
     return bool(
         np.isfinite(values).all() and np.ptp(values) > MIN_RELATIVE_VARIATION * np.abs(values).max()
     )
-
-
-SIGNIFICANCE_LEVEL = 0.01
-"""Significance level of test (3), divided by the number of tests for all parameters together."""
-MIN_RELEVANT_SCATTER = 1e-3
-"""Scatter below which groups count as consistent at any p-value, as a fraction of the value."""
-MIN_GROUPS_FOR_TREND = 4
-"""Minimum number of groups for which a trend covariate is searched."""
-COVARIATE_TIE_FACTOR = 2.0
-"""Maximum ratio of the mean square about the line to the smallest one, for a covariate that counts
-as indistinguishable from the best.
-"""
-MAX_INTERVAL_WIDTH = 4.0
-"""Maximum width of a group's 95 % interval, as a multiple of the parameter's range or value, for
-the group to be used.
-"""
 
 
 @dataclass(frozen=True)
@@ -347,6 +344,28 @@ def assess_consistency(models: ModelSet, model: FittedModel) -> tuple[ParameterC
             consistency = replace(consistency, trend_covariate=covariate)
         assessed.append(consistency)
     return tuple(assessed)
+
+
+def compute_prediction_half_widths(
+    consistencies: Sequence[ParameterConsistency],
+) -> dict[str, float]:
+    """Return half the prediction interval of each parameter for a new log, or else a new run.
+
+    Prediction intervals have the variation between logs (or runs) in them, in addition to the error
+    of the joint fit.
+
+    Args:
+        consistencies: Consistency of each parameter between runs, and between logs if there are
+            several.
+    """
+    # A new log is more general than a new run, so that it comes later and replaces it. Groups by a
+    # constant, such as a load, are not used.
+    return {
+        consistency.number: Z95 * consistency.prediction_sigma
+        for grouping in ("run", "log")
+        for consistency in consistencies
+        if consistency.by == grouping
+    }
 
 
 def _find_trend_covariate(
@@ -659,25 +678,3 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
     else:
         p_value = student_p_value(statistic, degrees_of_freedom)
     return Trend(slope, error, p_value, mean_square)
-
-
-def compute_prediction_half_widths(
-    consistencies: Sequence[ParameterConsistency],
-) -> dict[str, float]:
-    """Return half the prediction interval of each parameter for a new log, or else a new run.
-
-    Prediction intervals have the variation between logs (or runs) in them, in addition to the error
-    of the joint fit.
-
-    Args:
-        consistencies: Consistency of each parameter between runs, and between logs if there are
-            several.
-    """
-    # A new log is more general than a new run, so that it comes later and replaces it. Groups by a
-    # constant, such as a load, are not used.
-    return {
-        consistency.number: Z95 * consistency.prediction_sigma
-        for grouping in ("run", "log")
-        for consistency in consistencies
-        if consistency.by == grouping
-    }

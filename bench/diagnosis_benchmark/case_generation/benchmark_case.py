@@ -120,6 +120,20 @@ class BenchmarkCase(Document):
         return replace(self, effects=effects, size=size, beyond=beyond)
 
 
+class RecordedCase(NamedTuple):
+    """Recording of a case.
+
+    Attributes:
+        recording: the recording; the path of a model file is its name.
+        declared: system, for the units.
+        extra_files: texts of other files, by file name.
+    """
+
+    recording: Recording
+    declared: DeclaredSignals
+    extra_files: Mapping[str, str] = {}
+
+
 def name_case(
     kind: str,
     system: str,
@@ -160,20 +174,6 @@ def draw_size(kind: str, size: float | None, rng: np.random.Generator) -> float:
     """
     low = 3.0 if kind in ("double", "foreign") else 1.0
     return size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
-
-
-class RecordedCase(NamedTuple):
-    """Recording of a case.
-
-    Attributes:
-        recording: the recording; the path of a model file is its name.
-        declared: system, for the units.
-        extra_files: texts of other files, by file name.
-    """
-
-    recording: Recording
-    declared: DeclaredSignals
-    extra_files: Mapping[str, str] = {}
 
 
 def make_case_rng(name: str, purpose: str) -> np.random.Generator:

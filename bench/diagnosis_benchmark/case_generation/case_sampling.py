@@ -20,6 +20,7 @@ from bench.diagnosis_benchmark.case_generation.benchmark_case import (
     name_case,
 )
 from bench.diagnosis_benchmark.case_generation.effect_coefficients import find_coefficients
+from bench.diagnosis_benchmark.case_generation.equivalent_effects import find_equivalent_effects
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     SIMULATORS,
@@ -32,46 +33,16 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     count_held_out_runs,
     simulate_runs,
 )
-from bench.diagnosis_benchmark.case_generation.refitted_residuals import compute_unexplained_size
+from bench.diagnosis_benchmark.case_generation.refitted_residuals import (
+    compute_wrong_answer_residual,
+)
 from sims import effects as library
 from sims.recording.recording import Recording
 
 SYSTEMS = ("ball", "pendulum", "slider")
-SUBTHRESHOLD_SIZES = (0.1, 0.2, 0.3, 0.5)  # sizes for the power curve only
-
-
-EQUIVALENT_EFFECTS: tuple[tuple[str, bool, frozenset[str]], ...] = (
-    ("slider", True, frozenset({"gravity.tilt", "force.bias", "input.bias"})),
-    ("pendulum", True, frozenset({"force.bias", "input.bias"})),
-    ("pendulum", True, frozenset({"input.gain", "gravity.scale"})),  # the inertia absorbs the rest
-    ("pendulum", False, frozenset({"force.bias", "input.bias"})),
-    ("pendulum", False, frozenset({"gravity.tilt", "sensor.bias"})),  # gravity rotated and scaled
-    (
-        "ball",
-        False,
-        frozenset({"force.bias", "gravity.scale", "clock.skew"}),
-    ),  # no accelerometer is recorded
-)
-"""Effects that are exactly equivalent: they give the same motion for some parameters.
-
-Each entry is a system, whether it has an input, and the effects. The initial states may differ too.
-"""
-
-
-def find_equivalent_effects(system: str, driven: bool, effect: str) -> frozenset[str]:
-    """Return an effect and all effects that are equivalent to it: no recording tells them apart.
-
-    Args:
-        system: name of the system, such as ``pendulum``.
-        driven: whether there is an input.
-        effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
-    """
-    classes = (
-        names
-        for class_system, has_input, names in EQUIVALENT_EFFECTS
-        if (class_system, has_input) == (system, driven) and effect in names
-    )
-    return frozenset({effect}).union(*classes)
+"""Names of the systems."""
+SUBTHRESHOLD_SIZES = (0.1, 0.2, 0.3, 0.5)
+"""Sizes for the power curve only, in units of the noise."""
 
 
 def draw_case(
@@ -85,7 +56,7 @@ def draw_case(
     """Draw the hidden causes, the recording conditions and the size of the causes of a case.
 
     The causes are drawn first, then recording conditions in which they can be observed, and finally
-    their size in units of the noise, see `recording_conditions.draw_size`. Coefficients that give
+    their size in units of the noise, see `benchmark_case.draw_size`. Coefficients that give
     this size are found by simulation.
 
     Args:
@@ -140,7 +111,7 @@ def draw_case(
         hidden,
         target_size,
         lambda name: find_coefficients(name, fitted_setting, target_size, rng),
-        lambda effects: compute_unexplained_size(kind, fitted_setting, effects, target_size),
+        lambda effects: compute_wrong_answer_residual(kind, fitted_setting, effects, target_size),
     )
 
 

@@ -1,8 +1,8 @@
 """Coefficients of hidden causes as functions of a strength.
 
-The shape is drawn at random. The strength s remains free; 1 is the upper end of the plausible
-range. The bounds are those of the effect library. `shape(name, setting, rng)` returns the function
-from strength to coefficients.
+`draw_effect_shape` draws the shape of a cause at random and returns the function from strength to
+coefficients. Strength 1 is the upper end of the plausible range, whose bounds are those of the
+effect library. `find_coefficients` searches the strength at which the cause has a given size.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from sims.systems.servo import Servo
 
 CoefficientFunction = Callable[[float], tuple[float, ...]]
 """Function from strength to coefficients."""
-SIGNED_EFFECTS: tuple[str, ...] = (
+
+SIGNED_EFFECTS = (
     "force.bias",
     "gravity.scale",
     "input.gain",
@@ -37,9 +38,14 @@ SIGNED_EFFECTS: tuple[str, ...] = (
     "sensor.gain",
     "sensor.bias",
     "sensor.drift",
+    "clock.skew",
+    "spring.cubic",
+    "restitution.speed",
 )
-SIGNED_EFFECTS += ("clock.skew", "spring.cubic", "restitution.speed")
-MAX_STRENGTH = 2.0  # maximum strength: twice the plausible range
+"""Effects whose sign is drawn."""
+
+MAX_STRENGTH = 2.0
+"""Maximum strength: twice the plausible range."""
 
 
 class BaseMotion:
@@ -75,6 +81,34 @@ class BaseMotion:
         """Median absolute speed, by finite differences."""
         speeds = np.concatenate([np.diff(path) for path in self.paths]) * self.rate
         return float(np.median(np.abs(speeds)))
+
+
+def find_coefficients(
+    name: str, setting: RecordingConditions, target_size: float, rng: np.random.Generator
+) -> tuple[float, ...] | None:
+    """Find coefficients of a hidden cause at which the residual has the requested size.
+
+    Args:
+        name: name of the effect or unmodelled cause.
+        setting: recording conditions.
+        target_size: size in units of the noise.
+        rng: random generator for the shape of the cause.
+
+    Returns:
+        Coefficients, or None if no strength up to the maximum gives this size.
+    """
+    # The shape (sign, direction, period) is drawn; the strength that scales it is searched.
+    compute_coefficients = draw_effect_shape(name, setting, rng)
+    compute_residual = refitted_residuals.make_gap_function(
+        setting, lambda strength: simulate_causes(setting, {name: compute_coefficients(strength)})
+    )
+    strength_and_size = find_strength_for_size(
+        compute_residual, target_size, get_max_strength(name)
+    )
+    if strength_and_size is None:
+        return None
+    strength, _ = strength_and_size
+    return compute_coefficients(strength)
 
 
 def draw_effect_shape(
@@ -114,6 +148,24 @@ def get_max_strength(name: str) -> float:
     almost the whole input; `input.hold` is a share of linear interpolation, at most 1.
     """
     return {"input.saturation": 0.97, "input.hold": 1.0}.get(name, MAX_STRENGTH)
+
+
+def list_coefficient_names(system: str, name: str) -> list[str]:
+    """List the names of an effect's coefficients, in the order of the numbers in a case.
+
+    They may depend on the system, as the number of directions does; those of the robot arm arm2
+    do not.
+
+    Args:
+        system: name of the system, such as ``pendulum``.
+        name: name of the effect, with or without a place, as ``friction.coulomb@elbow``.
+    """
+    effect = library.get_effect(name.partition("@")[0])
+    if system == "arm2":
+        return [coefficient.name for coefficient in effect.coefficients]
+    system_model = Servo.system if system == "servo" else SIMULATORS[system].system
+    # `on` gives the coefficients that the effect has on this system.
+    return [coefficient.name for coefficient in effect.on(system_model)]
 
 
 def draw_direction(
@@ -702,49 +754,3 @@ UNMODELLED_SAMPLERS: dict[tuple[bool, str], Callable[..., CoefficientFunction]] 
     (True, "wear"): _draw_changing_restitution,
     (True, "layer"): _draw_drag_layer,
 }
-
-
-def list_coefficient_names(system: str, name: str) -> list[str]:
-    """List the names of an effect's coefficients, in the order of the numbers in a case.
-
-    They may depend on the system, as the number of directions does; those of the robot arm arm2
-    do not.
-
-    Args:
-        system: name of the system, such as ``pendulum``.
-        name: name of the effect, with or without a place, as ``friction.coulomb@elbow``.
-    """
-    effect = library.get_effect(name.partition("@")[0])
-    if system == "arm2":
-        return [coefficient.name for coefficient in effect.coefficients]
-    system_model = Servo.system if system == "servo" else SIMULATORS[system].system
-    # `on` gives the coefficients that the effect has on this system.
-    return [coefficient.name for coefficient in effect.on(system_model)]
-
-
-def find_coefficients(
-    name: str, setting: RecordingConditions, target_size: float, rng: np.random.Generator
-) -> tuple[float, ...] | None:
-    """Find coefficients of a hidden cause at which the residual has the requested size.
-
-    Args:
-        name: name of the effect or unmodelled cause.
-        setting: recording conditions.
-        target_size: size in units of the noise.
-        rng: random generator for the shape of the cause.
-
-    Returns:
-        Coefficients, or None if no strength up to the maximum gives this size.
-    """
-    # The shape (sign, direction, period) is drawn; the strength that scales it is searched.
-    compute_coefficients = draw_effect_shape(name, setting, rng)
-    compute_residual = refitted_residuals.make_gap_function(
-        setting, lambda strength: simulate_causes(setting, {name: compute_coefficients(strength)})
-    )
-    strength_and_size = find_strength_for_size(
-        compute_residual, target_size, get_max_strength(name)
-    )
-    if strength_and_size is None:
-        return None
-    strength, _ = strength_and_size
-    return compute_coefficients(strength)

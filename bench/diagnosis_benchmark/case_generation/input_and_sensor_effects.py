@@ -1,4 +1,7 @@
-"""True system of a case, and the laws of its inputs and sensors in the reference simulations."""
+"""True system of a case, and the laws by which hidden effects change inputs and sensor readings.
+
+The reference simulations use these laws, which share no code with the effect library.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,21 @@ from sims.core.simulator import Array, Scenario
 
 EffectCoefficients = Mapping[str, Sequence[float]]
 """Coefficients of effects, by the name of the effect."""
+
+SLEW_STEP = 2e-3
+"""Time for which an input with limited rate is held constant, s."""
+
+SUBDIVISIONS = 10
+"""Number of parts of an interval in which a linear command is held constant."""
+
+NONLINEAR_INPUT_EFFECTS = (
+    "input.deadband",
+    "input.saturation",
+    "backlash",
+    "input.rate",
+    "input.power",
+)
+"""Input effects that must act before a lag of the input."""
 
 
 @dataclass(frozen=True)
@@ -30,18 +48,6 @@ class TrueSystem:
     parameters: Mapping[str, float]
     constants: Mapping[str, float]
     effects: EffectCoefficients = field(default_factory=dict)
-
-
-SLEW_STEP = 2e-3  # seconds for which an input with limited rate is held constant
-SUBDIVISIONS = 10  # number of parts of an interval in which a linear command is held constant
-
-NONLINEAR_INPUT_EFFECTS = (
-    "input.deadband",
-    "input.saturation",
-    "backlash",
-    "input.rate",
-    "input.power",
-)
 
 
 @dataclass(frozen=True)
@@ -232,6 +238,7 @@ STEPWISE_INPUT_EFFECTS: dict[str, Callable[..., Array]] = {
     "backlash": _apply_backlash,
 }
 """Input effects without memory, except `backlash`: functions of the levels and coefficients."""
+
 SENSOR_EFFECTS: dict[str, Callable[[Array, Sequence[float], Array, Array], Array]] = {
     "sensor.gain": lambda y, c, elapsed, times: y * (1 + c[0]),
     "sensor.bias": lambda y, c, elapsed, times: y + c[0],
@@ -266,7 +273,7 @@ def compute_read_times(effects: EffectCoefficients, times: Array) -> Array:
     return read_times
 
 
-def apply_lag(values: Array, grid: Array, lag: float) -> Array:
+def apply_sensor_lag(values: Array, grid: Array, lag: float) -> Array:
     """Apply a first-order sensor lag: solve y' = (x - y) / lag.
 
     The solution is exact for readings x that are linear between grid points.

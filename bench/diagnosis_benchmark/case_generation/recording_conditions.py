@@ -1,6 +1,6 @@
-"""Benchmark cases and their recording conditions, drawn from a seed.
+"""Recording conditions of benchmark cases, drawn from a seed.
 
-They are parameters, runs, inputs, channels and noise.
+They are true base parameters, runs with inputs, channels, and sensor noise.
 """
 
 from __future__ import annotations
@@ -21,6 +21,13 @@ from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider
 
+SIMULATORS: dict[str, type[SystemSimulator]] = {
+    "ball": Ball,
+    "pendulum": Pendulum,
+    "slider": Slider,
+}
+"""Simulators by the name of their system."""
+
 GROUND_PARALLEL_EFFECTS = (
     "gravity.tilt",
     "lift.magnus",
@@ -30,33 +37,35 @@ GROUND_PARALLEL_EFFECTS = (
     "updraft",
     "gust",
 )
+"""Effects that only the horizontal motion of a ball shows."""
+
+INPUT_DEPENDENT_EFFECTS = ("input.", "backlash", "supply.", "friction.load_")
+"""Prefixes of the effects that only an input shows."""
+
+NOISE_KINDS = ("white", "ar1", "quantised")
+"""Kinds of sensor noise: white, AR(1), or white before rounding."""
+
 NOISE_RANGES = {
     "ball": (2e-3, 2e-2),
     "pendulum": (1e-3, 1e-2),
     "slider": (1e-3, 1e-2),
-}  # sigma, m or rad
+}
+"""Ranges of the standard deviation of the noise by system, m or rad."""
+
 FREQUENCY_RANGES = {
     "pendulum": (3.0, 10.0),
     "slider": (2.0, 5.0),
-}  # ratio of the noise of the rate to that of the position, 1/s
-PENDULUM = Pendulum(
-    observe=["q"], engine="batch"
-)  # used to estimate the swing of a drawn pendulum; generates no data
-DrawnConditions = tuple[dict[str, float], tuple[str, ...], list[Scenario]]
-MAX_RUNS = 6
-NOISE_KINDS = ("white", "ar1", "quantised")
-INPUT_DEPENDENT_EFFECTS = (
-    "input.",
-    "backlash",
-    "supply.",
-    "friction.load_",
-)  # effects that only an input shows
-
-SIMULATORS: dict[str, type[SystemSimulator]] = {
-    "ball": Ball,
-    "pendulum": Pendulum,
-    "slider": Slider,
 }
+"""Ranges of the ratio of a rate's noise to the position's, by system, 1/s."""
+
+MAX_RUNS = 6
+"""Maximum number of runs."""
+
+PENDULUM = Pendulum(observe=["q"], engine="batch")
+"""Simulator that estimates the swing of a drawn pendulum; it generates no data."""
+
+DrawnConditions = tuple[dict[str, float], tuple[str, ...], list[Scenario]]
+"""Parameters by name, names of the channels, and runs."""
 
 
 @dataclass(frozen=True)
@@ -204,6 +213,16 @@ def draw_conditions(
     return RecordingConditions(
         system, parameters, get_constants(system), channels, tuple(scenarios), noise, rate, seconds
     )
+
+
+def get_constants(system: str, **changed: float) -> dict[str, float]:
+    """Return the constants of a system by name.
+
+    Args:
+        system: name of the system, such as ``pendulum``.
+        **changed: constants with other values.
+    """
+    return {c.name: c.value for c in SIMULATORS[system].constants} | changed
 
 
 def _draw_sensor_noise(
@@ -374,13 +393,3 @@ def draw_input_signal(
     random_phase = rng.random()  # in cycles
     signal: Array = np.sin(2 * np.pi * (cycles + random_phase))
     return signal
-
-
-def get_constants(system: str, **changed: float) -> dict[str, float]:
-    """Return the constants of a system by name.
-
-    Args:
-        system: name of the system, such as ``pendulum``.
-        **changed: constants with other values.
-    """
-    return {c.name: c.value for c in SIMULATORS[system].constants} | changed

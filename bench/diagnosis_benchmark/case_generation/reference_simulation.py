@@ -1,8 +1,12 @@
-"""Noise-free reference recordings of ball, pendulum or slider, with effects or unmodelled causes.
+"""Simulate recordings of ball, pendulum or slider with hidden effects or unmodelled causes.
 
-They are solved with scipy or simulated by MuJoCo, not by the engine that `explain` uses (except
-`simulate_with_mujoco` with hidden-state effects). sims/effects/README.md defines the coefficients
-of the effects. The unmodelled causes, which the library does not contain, are:
+The runs of a case (`simulate_runs`) are solved with scipy or simulated by MuJoCo, not by the engine
+that `explain` uses, except for hidden-state effects in `simulate_with_mujoco`. The observations by
+which causes are sized (`simulate_causes`, `simulate_observations`) have no noise and mostly come
+from that engine, which is faster.
+
+sims/effects/README.md defines the coefficients of the effects. The unmodelled causes, which the
+library does not contain, are:
 
 | cause | numbers | meaning |
 |---|---|---|
@@ -23,16 +27,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.diagnosis_benchmark.case_generation import (
-    ball_reference,
-    joint_reference,
-)
+from bench.diagnosis_benchmark.case_generation import ball_reference, joint_reference
 from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase, make_case_rng
 from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import (
     SENSOR_EFFECTS,
     EffectCoefficients,
     TrueSystem,
-    apply_lag,
+    apply_sensor_lag,
     compute_read_times,
 )
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
@@ -43,28 +44,57 @@ from sims import effects as library
 from sims.core.simulator import Array, Scenario
 from sims.recording.recording import Run
 
-__all__ = [
-    "CHANNELS",
-    "SIMULATORS",
-    "UNMODELLED_CAUSES",
-    "EffectCoefficients",
-    "TrueSystem",
-    "simulate_with_mujoco",
-    "simulate_with_scipy",
-]
-
 UNMODELLED_CAUSES = {
     "ball": ball_reference.UNMODELLED_CAUSES,
     "pendulum": joint_reference.UNMODELLED_CAUSES,
     "slider": joint_reference.UNMODELLED_CAUSES,
 }
+"""Unmodelled causes by system."""
+
 CHANNELS = {"ball": ("x", "y", "z"), "pendulum": ("q", "qd"), "slider": ("x", "v")}
-FINE_STEP_SECONDS = 5e-4  # seconds: maximum step in which a lagging sensor is integrated
-MUJOCO_STEP_SECONDS = (
-    1e-3  # seconds: at MuJoCo's default step its error would be a tenth of the noise
-)
+"""Channels that the reference simulations can observe, by system."""
+
+FINE_STEP_SECONDS = 5e-4
+"""Maximum step in which a lagging sensor is integrated, s."""
+
+MUJOCO_STEP_SECONDS = 1e-3
+"""Step of MuJoCo, s; at its default step the error would be a tenth of the noise."""
+
 HIDDEN_STATE_STEP = 2.5e-3
 """Step of the engine for effects with hidden states, s."""
+
+
+def simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
+    """Simulate every run of a case, add sensor noise, and mark the last runs as held out.
+
+    Args:
+        case: the case; it states the simulator of the recording (`source`).
+        setting: its recording conditions, with all runs.
+
+    Returns:
+        The runs, named by their indices, with noisy channels and the inputs.
+    """
+    rng = make_case_rng(case.name, "noise")
+    first_held_out = case.runs - count_held_out_runs(case)
+    true_system, runs = setting.make_true_system(case.effects), []
+    for run_index, scenario in enumerate(setting.scenarios):
+        if case.source == "mujoco":
+            observed = simulate_with_mujoco(true_system, scenario, setting.channels)
+        else:
+            observed = simulate_with_scipy(true_system, scenario, setting.channels, run_index)
+        recorded = setting.noise.add_to(observed, rng)
+        channels = dict(zip(setting.channels, recorded.T, strict=True))
+        is_held_out = run_index >= first_held_out
+        # The recording states neither initial states nor constants of a run.
+        runs.append(
+            Run(str(run_index), scenario.times, channels, scenario.inputs, {}, {}, is_held_out)
+        )
+    return tuple(runs)
+
+
+def count_held_out_runs(case: BenchmarkCase) -> int:
+    """Return the number of held-out runs; they are the last runs of the recording."""
+    return max(1, case.runs // 3)
 
 
 def simulate_with_scipy(
@@ -105,7 +135,7 @@ def simulate_with_scipy(
                 observed[:, read_column], coefficients, grid, scenario.times[0] + grid
             )
         elif name == "sensor.lag":
-            observed = apply_lag(observed, grid, coefficients[0])
+            observed = apply_sensor_lag(observed, grid, coefficients[0])
     return observed[sample_indices]
 
 
@@ -175,11 +205,6 @@ def _refine_time_grid(instants: Array) -> tuple[Array, NDArray[np.intp]]:
     return np.array(grid), np.array(sample_indices)
 
 
-def count_held_out_runs(case: BenchmarkCase) -> int:
-    """Return the number of held-out runs; they are the last runs of the recording."""
-    return max(1, case.runs // 3)
-
-
 def simulate_causes(setting: RecordingConditions, causes: EffectCoefficients) -> Array:
     """Simulate noise-free observations (R, T, C) with hidden causes.
 
@@ -202,36 +227,11 @@ def simulate_causes(setting: RecordingConditions, causes: EffectCoefficients) ->
     )
 
 
-def simulate_runs(case: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
-    """Simulate every run of a case, add sensor noise, and mark the last runs as held out.
-
-    Args:
-        case: the case; it states the simulator of the recording (`source`).
-        setting: its recording conditions, with all runs.
-
-    Returns:
-        The runs, named by their indices, with noisy channels and the inputs.
-    """
-    rng = make_case_rng(case.name, "noise")
-    first_held_out = case.runs - count_held_out_runs(case)
-    true_system, runs = setting.make_true_system(case.effects), []
-    for run_index, scenario in enumerate(setting.scenarios):
-        if case.source == "mujoco":
-            observed = simulate_with_mujoco(true_system, scenario, setting.channels)
-        else:
-            observed = simulate_with_scipy(true_system, scenario, setting.channels, run_index)
-        recorded = setting.noise.add_to(observed, rng)
-        channels = dict(zip(setting.channels, recorded.T, strict=True))
-        is_held_out = run_index >= first_held_out
-        # The recording states neither initial states nor constants of a run.
-        runs.append(
-            Run(str(run_index), scenario.times, channels, scenario.inputs, {}, {}, is_held_out)
-        )
-    return tuple(runs)
-
-
 def simulate_observations(setting: RecordingConditions, effects: EffectCoefficients) -> Array:
     """Simulate noise-free observations (R, T, C) with given effects by the batch engine.
+
+    They serve to size the causes of a case. `explain` uses the same engine, so recordings of the
+    benchmark must not come from it.
 
     Shapes: R runs, T samples, C channels.
 

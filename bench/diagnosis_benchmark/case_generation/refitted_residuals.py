@@ -16,41 +16,69 @@ from itertools import product
 
 import numpy as np
 
+from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import EffectCoefficients
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     SIMULATORS,
     RecordingConditions,
 )
-from bench.diagnosis_benchmark.case_generation.reference_simulation import (
-    EffectCoefficients,
-    simulate_causes,
-)
+from bench.diagnosis_benchmark.case_generation.reference_simulation import simulate_causes
 from bench.diagnosis_benchmark.case_generation.strength_search import arrange_slopes
 from sims import effects as library
 from sims.core.root_mean_square import compute_rms
 from sims.core.simulator import Array
 
-FINITE_DIFFERENCE_STEP = 1e-5  # finite-difference step, as a fraction of a parameter's scale
-DIVERGED_VALUE = 1e30  # in units of the noise: larger values count as diverged
+FINITE_DIFFERENCE_STEP = 1e-5
+"""Finite-difference step, as a fraction of a parameter's scale."""
+
+DIVERGED_VALUE = 1e30
+"""Value in units of the noise beyond which a simulation counts as diverged."""
+
 FIRST_DAMPING = 1e-6
 """Damping of the first step, relative to the squared sensitivities."""
+
 DAMPING_INCREASE = 30.0
 """Factor of the damping after a step that does not decrease the sum of squares."""
+
 DAMPING_DECREASE = 10.0
 """Divisor of the damping after any other step."""
+
 MAX_DAMPING = 1e3
 """Damping at which a fit ends."""
+
 MIN_RELATIVE_GAIN = 1e-3
 """Relative decrease of the RMS residual below which a fit has converged."""
+
 RIDGE = 1e-9
 """Constant part of the damping, relative to the largest squared sensitivity."""
+
 SATURATION_SHARES = (0.9, 0.6)
 """Limits of an input from which its fit starts, as shares of the input's peak."""
+
 STOP_INSET_SHARES = (0.03, 0.15)
 """Distances of an end stop from the end of the travel, as shares of the travel."""
+
 STOP_STIFFNESS_SHARES = (0.001, 0.01, 0.1)
 """Stiffnesses of an end stop from which its fit starts, as shares of the largest one."""
+
 STOP_LOSS = 0.05
 """Damping of an end stop from which its fit starts, as a factor of the approach velocity, s/m."""
+
+MAX_REFITTED_EFFECTS = 4
+"""Number of effects that are refitted, those with the smallest first-order residual."""
+
+STARTS_PER_EFFECT = 3
+"""Number of starting points from which one effect is refitted."""
+
+SHAPE_GRIDS: dict[str, list[tuple[float, ...]]] = {
+    "force.periodic": [(f,) for f in (0.2, 0.4, 0.7, 1.2, 2.0, 3.5)],
+    "force.ripple": [(p,) for p in (0.1, 0.2, 0.4, 0.8, 1.6, 3.0, 6.0)],
+    "friction.position": [(p,) for p in (0.3, 0.6, 1.2, 2.5, 5.0)],
+    "friction.warming": [(s,) for s in (0.7, 2.0, 6.0)],
+    "friction.stribeck": [(s,) for s in (0.05, 0.2, 1.0)],
+    "sensor.slip": [(s,) for s in (0.3, 0.7, 1.2, 2.0, 3.0, 4.0)],
+    "wind": [(u, v) for u in (-4.0, 0.0, 4.0) for v in (-4.0, 0.0, 4.0)],
+}
+"""Shape parameters from which the fit of an effect starts, in the units of the library."""
 
 SIMPLER_EFFECTS = {
     "friction.direction": ("drag.linear",),
@@ -60,13 +88,10 @@ SIMPLER_EFFECTS = {
     "friction.stribeck": ("friction.coulomb",),
     "input.power": ("input.gain",),
     "friction.warming": ("friction.coulomb", "drag.linear"),
-    "wind": (
-        "drag.linear",
-        "drag.quadratic",
-        "force.bias",
-        "gravity.tilt",
-    ),  # fast air is a steady push
+    # Wind that is fast compared with the motion is a constant force.
+    "wind": ("drag.linear", "drag.quadratic", "force.bias", "gravity.tilt"),
 }
+"""Simpler effects that an effect can resemble, by its name."""
 
 
 @dataclass(frozen=True)
@@ -282,19 +307,44 @@ def make_gap_function(
     return compute_size
 
 
-MAX_REFITTED_EFFECTS = 4  # number of effects refitted, those with the smallest first-order residual
-STARTS_PER_EFFECT = 3  # number of starting points from which one effect is refitted
-SHAPE_GRIDS: dict[
-    str, list[tuple[float, ...]]
-] = {  # initial guesses of shape parameters, in the units of the library
-    "force.periodic": [(f,) for f in (0.2, 0.4, 0.7, 1.2, 2.0, 3.5)],
-    "force.ripple": [(p,) for p in (0.1, 0.2, 0.4, 0.8, 1.6, 3.0, 6.0)],
-    "friction.position": [(p,) for p in (0.3, 0.6, 1.2, 2.5, 5.0)],
-    "friction.warming": [(s,) for s in (0.7, 2.0, 6.0)],
-    "friction.stribeck": [(s,) for s in (0.05, 0.2, 1.0)],
-    "sensor.slip": [(s,) for s in (0.3, 0.7, 1.2, 2.0, 3.0, 4.0)],
-    "wind": [(u, v) for u in (-4.0, 0.0, 4.0) for v in (-4.0, 0.0, 4.0)],
-}
+def compute_wrong_answer_residual(
+    kind: str, setting: RecordingConditions, effects: EffectCoefficients, size: float
+) -> float | None:
+    """Compute the RMS residual that the best wrong answer leaves, in units of the noise.
+
+    It would be a correct answer if it left little. Wrong answers by kind of case:
+
+    * single: simpler forms of the effect, such as Coulomb friction for Stribeck friction,
+    * double: each of the two effects alone,
+    * foreign: the best effect of the library.
+
+    Args:
+        kind: single, double or foreign.
+        setting: recording conditions with the runs for fitting only.
+        effects: coefficients of the hidden causes by name.
+        size: size of each in units of the noise.
+
+    Returns:
+        The residual; 0 if the simulation with the causes diverges, so that the case is rejected;
+        None for a single effect that has no simpler form or is smaller than the noise.
+    """
+    # Effects with the coefficients from which their fit starts; None for several guesses.
+    wrong_answers = (
+        [(simpler, None) for name in effects for simpler in SIMPLER_EFFECTS.get(name, ())]
+        if kind == "single"
+        else list(effects.items())
+    )
+    if kind == "single" and (not wrong_answers or size < 1.0):
+        return None
+    observed = simulate_causes(setting, effects)
+    if not np.isfinite(observed).all():
+        return 0.0
+    if kind == "foreign":
+        return compute_smallest_residual(setting, observed)
+    return min(
+        compute_refitted_residual(setting, observed, name, coefficients)
+        for name, coefficients in wrong_answers
+    )
 
 
 def compute_refitted_residual(
@@ -477,43 +527,3 @@ def _estimate_linear_step(
     step = fit.compute_step(residual, slope, damping=1e-9)
     theta[:fitted_count] += step[:fitted_count] * fit.scales[:fitted_count]
     return compute_rms(residual - slope @ step), np.clip(theta, fit.low, fit.high)
-
-
-def compute_unexplained_size(
-    kind: str, setting: RecordingConditions, effects: EffectCoefficients, size: float
-) -> float | None:
-    """Compute the RMS residual that the best wrong answer leaves, in units of the noise.
-
-    It would be a correct answer if it left little. Wrong answers by kind of case:
-
-    * single: simpler forms of the effect, such as Coulomb friction for Stribeck friction,
-    * double: each of the two effects alone,
-    * foreign: the best effect of the library.
-
-    Args:
-        kind: single, double or foreign.
-        setting: recording conditions with the runs for fitting only.
-        effects: coefficients of the hidden causes by name.
-        size: size of each in units of the noise.
-
-    Returns:
-        The residual; 0 if the simulation with the causes diverges, so that the case is rejected;
-        None for a single effect that has no simpler form or is smaller than the noise.
-    """
-    # Effects with the coefficients from which their fit starts; None for several guesses.
-    wrong_answers = (
-        [(simpler, None) for name in effects for simpler in SIMPLER_EFFECTS.get(name, ())]
-        if kind == "single"
-        else list(effects.items())
-    )
-    if kind == "single" and (not wrong_answers or size < 1.0):
-        return None
-    observed = simulate_causes(setting, effects)
-    if not np.isfinite(observed).all():
-        return 0.0
-    if kind == "foreign":
-        return compute_smallest_residual(setting, observed)
-    return min(
-        compute_refitted_residual(setting, observed, name, coefficients)
-        for name, coefficients in wrong_answers
-    )

@@ -17,6 +17,7 @@ from bench.diagnosis_benchmark.case_generation.benchmark_case import (
     make_case_rng,
     name_case,
 )
+from bench.diagnosis_benchmark.case_generation.equivalent_effects import find_equivalent_effects
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     RequestedConditions,
@@ -155,32 +156,8 @@ def _choose_hidden_causes(
     candidates = tuple(name for name in candidates if name != first)
     # Without another candidate it is the first effect again, which is equivalent to itself.
     second = str(rng.choice(candidates)) if candidates else first
-    return () if second in find_equivalent_causes(system, first) else (first, second)
-
-
-EQUIVALENT_CAUSES: dict[str, tuple[frozenset[str], ...]] = {
-    # A motor that never reaches its limit converts an offset of the goal into a torque.
-    "servo": (frozenset({"force.bias", "input.bias"}),),
-    "arm2": tuple(
-        frozenset(names)
-        for joint, body in (("shoulder", "upper_arm"), ("elbow", "forearm"))
-        for names in (
-            {f"force.bias@{joint}", f"input.bias@m_{joint}"},
-            *([{f"inertia.armature@{joint}", f"inertia.scale@{body}"}] * (joint == "shoulder")),
-        )
-    ),
-}
-"""Causes that give exactly the same motion, by machine."""
-
-
-def find_equivalent_causes(system: str, name: str) -> frozenset[str]:
-    """Return a cause and all causes that are equivalent to it.
-
-    Args:
-        system: servo or arm2.
-        name: ``effect@place`` or ``effect``.
-    """
-    return frozenset({name}).union(*(names for names in EQUIVALENT_CAUSES[system] if name in names))
+    equivalent_effects = find_equivalent_effects(system, driven=True, effect=first)
+    return () if second in equivalent_effects else (first, second)
 
 
 class _ArmSignals(System):

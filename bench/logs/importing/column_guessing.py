@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from bench.logs.quality.range_checks import is_within_widened_range
 from sims.core.simulator import Array
 from sims.recording.log_formats.unit_names import read_unit, split_unit
 from sims.recording.log_time_alignment import MAX_REPEATED
@@ -342,23 +343,12 @@ def guess_position_unit(values: Array, joint: Joint) -> str | None:
     if joint.range is None:
         is_in_degrees = is_hinge and np.abs(extremes).max() > MAX_UNLIMITED_POSITION_RAD
         return small_unit if is_in_degrees else si_unit
-    if _is_within_limits(extremes, joint.range):
+    if is_within_widened_range(extremes, joint.range, MAX_RANGE_EXCESS):
         return si_unit
     converted_extremes = extremes / (DEGREES_PER_RADIAN if is_hinge else 1e3)
-    return small_unit if _is_within_limits(converted_extremes, joint.range) else None
-
-
-def _is_within_limits(extremes: Array, limits: tuple[float, float]) -> bool:
-    """Return whether positions lie within a joint's range, widened by `MAX_RANGE_EXCESS` of it.
-
-    Args:
-        extremes: (2,) lowest and highest position.
-        limits: range of the joint, in the same unit.
-    """
-    lower_limit, upper_limit = limits
-    slack = MAX_RANGE_EXCESS * (upper_limit - lower_limit)
-    lowest, highest = extremes
-    return bool(lower_limit - slack <= lowest and highest <= upper_limit + slack)
+    if is_within_widened_range(converted_extremes, joint.range, MAX_RANGE_EXCESS):
+        return small_unit
+    return None
 
 
 def is_constant(values: Array) -> bool:

@@ -7,13 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bench.logs.importing.import_result import ImportOptions, ImportResult
-from bench.logs.importing.run_logs import RunLogs, hold_signal
-from bench.logs.importing.servo_estimation import AddedServo, estimate_added_servo
+from bench.logs.importing.run_logs import RunLogs
+from bench.logs.importing.servo_estimation import AddedServo, estimate_added_servos
 from bench.logs.importing.signal_assignment import Signal, SignalAssignment
-from sims.core.simulator import Array
 from sims.core.toml_validation import toml_key, toml_text
-from sims.robot.dynamics.joint_scales import compute_joint_scales
-from sims.robot.robot_model import Joint
 
 FREE_GAINS = "actuator.stiffness", "actuator.damping"
 """Free numbers of a servo that is missing in the model file."""
@@ -61,10 +58,9 @@ class DescriptionWriter:
         must check as comments, the model file, and the unknown gains of servos. Guesses have a
         comment.
         """
-        servos = [
-            self._estimate_added_servo(*named_servo)
-            for named_servo in self._signals.added_servos.items()
-        ]
+        servos = estimate_added_servos(self._logs, self._signals)
+        for servo in servos:
+            self._report_gains(servo)
         body = [*self._list_time_lines(), *self._run_lines()]
         for servo in servos:
             body += [
@@ -160,8 +156,8 @@ class DescriptionWriter:
         )
         return [*lines, ""]
 
-    def _estimate_added_servo(self, name: str, joint: Joint) -> AddedServo:
-        """Estimate the gains of a servo that the model file lacks, and report their origin.
+    def _report_gains(self, servo: AddedServo) -> None:
+        """Report the gains of a servo that is missing in the model file.
 
         * If the log moves the joint, the gains are free: `explain` fits them, starting from values
           measured from the response to the command, or else from those of a typical servo. This is
@@ -170,12 +166,9 @@ class DescriptionWriter:
           user has to check this, so it is listed with the checks.
 
         Args:
-            name: name of the new servo.
-            joint: joint that it drives.
+            servo: the new servo with its gains.
         """
-        signals = self._signals
-        inertia = float(compute_joint_scales(signals.robot).inertia[signals.joints.index(joint)])
-        servo = estimate_added_servo(name, joint, inertia, self._collect_servo_samples(name, joint))
+        joint = servo.joint
         frequency, damping = servo.response
         gains = f"for {frequency:.3g} rad/s and a damping ratio of {damping:.2g}"
         if servo.is_free:
@@ -190,43 +183,8 @@ class DescriptionWriter:
                 f"gains of the servo of {joint.name}: the log does not move this joint and cannot "
                 f"show them; kp = {servo.kp:.4g} and kv = {servo.kv:.4g} ({gains}) only hold its "
                 f"position and are not fitted; state those of the drive in "
-                f"[actuators.{toml_key(name)}], or import a log that moves the joint"
+                f"[actuators.{toml_key(servo.name)}], or import a log that moves the joint"
             )
-        return servo
-
-    def _collect_servo_samples(self, name: str, joint: Joint) -> list[tuple[Array, Array, Array]]:
-        """Collect times (s), commands and positions (T,) of a servo in each run, in rad or m.
-
-        A command holds until the next one, since it has other sample times than the position. Runs
-        without one of them are left out.
-
-        Args:
-            name: name of the servo.
-            joint: joint that it drives.
-
-        Returns:
-            One triple per run; none without a recorded position.
-        """
-        command = self._signals.inputs[f"u.{name}"]
-        position = self._signals.get_position(joint.name)
-        samples: list[tuple[Array, Array, Array]] = []
-        if position is None:
-            return samples
-        for run in self._logs.runs:
-            command_samples = self._logs.read(run, command.column)
-            measured = self._logs.read(run, position.column)
-            if command_samples is None or measured is None:
-                continue
-            times, values = measured
-            held_command = hold_signal(*command_samples, times)
-            samples.append(
-                (
-                    times,
-                    command.convert(joint.unit, held_command),
-                    position.convert(joint.unit, values),
-                )
-            )
-        return samples
 
     def _make_relative(self, path: Path) -> str:
         """Return a path relative to the folder of the description, with forward slashes.

@@ -20,7 +20,7 @@ of the columns is the permutation p that minimises the root mean square distance
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations, permutations
 from typing import NamedTuple
 
@@ -208,7 +208,7 @@ def find_order_by_commands(
     distances = _compute_square_distances(commands, positions)
     if distances is None:
         return None
-    order = find_best_order(distances)
+    order = _find_best_order(distances)
     moved_commands = [command for command, position in enumerate(order) if position != command]
     if not moved_commands:
         return None
@@ -234,7 +234,7 @@ def are_followed(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
     return bool((np.argmin(distances, axis=1) == np.arange(len(distances))).all())
 
 
-def find_best_order(distances: Array) -> list[int]:
+def _find_best_order(distances: Array) -> list[int]:
     """Return the order in which the positions are closest to the commands.
 
     It is the permutation p that minimises d(p) = sqrt(sum_i mean((u_i - q_p(i))^2)) (1), with
@@ -253,6 +253,28 @@ def find_best_order(distances: Array) -> list[int]:
     _, assigned = linear_sum_assignment(distances)
     order: list[int] = assigned.tolist()
     return order
+
+
+def find_order_by_variance(
+    runs: Iterable[tuple[Sequence[Array], Sequence[Array]]], joint_count: int
+) -> dict[int, int]:
+    """Return the order of positions that follows the commands best, up to constant offsets.
+
+    A position differs little from its own command, so the variance of the difference is the cost of
+    the linear assignment. The zero of a position may differ from that of its command.
+
+    Args:
+        runs: commands and positions of each run, a (T,) array of each of J joints.
+        joint_count: number J of joints.
+
+    Returns:
+        For the index of each command, the index of the joint whose position follows it.
+    """
+    costs = np.zeros((joint_count, joint_count))
+    for commands, positions in runs:
+        for i, j in np.ndindex(joint_count, joint_count):
+            costs[i, j] += float(np.nanvar(positions[j] - commands[i]))
+    return dict(enumerate(_find_best_order(costs)))
 
 
 def _compute_square_distances(

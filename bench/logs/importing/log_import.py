@@ -33,6 +33,47 @@ Logs: TypeAlias = Annotated[
 """Files of one run, or folders with the files of one run each."""
 
 
+@dataclass(frozen=True)
+class ImportRequest(ImportOptions):
+    """Logs to be described, with what the user states about them.
+
+    Attributes:
+        logs: Files of one run, or folders with the files of one run each.
+        model: Model file of the robot, MJCF or URDF.
+        out: Path NAME.toml of a new file.
+    """
+
+    logs: Logs
+    model: str | Path
+    out: str | Path
+
+
+@takes_options(ImportRequest)
+def import_logs(options: ImportRequest) -> ImportResult:
+    """Write a description (TOML) of a robot's raw logs, so that all commands can read them.
+
+    Args:
+        options: Arguments, the attributes of `ImportRequest` and, by name, those of
+            `bench.logs.importing.import_result.ImportOptions`.
+
+    Returns:
+        The guesses, the columns that were left out, and what to check.
+
+    Raises:
+        InputError: The logs cannot be read or contain nothing of the robot; the message is one
+            line, and nothing is written.
+    """
+    logs = [options.logs] if isinstance(options.logs, str | Path) else options.logs
+    model, path = Path(options.model), Path(options.out)
+    if path.suffix != ".toml":
+        raise InputError(f"expected a description to write, NAME.toml, found '{path}'")
+    check_absent([path])
+    paths = [Path(log) for log in logs]
+    result = describe_logs(paths, read_robot(model), model, path.parent, options)
+    write_checked_description(path, result.text)
+    return result
+
+
 def describe_logs(
     logs: Sequence[Path],
     robot: RobotModel,
@@ -103,44 +144,3 @@ def write_checked_description(path: Path, text: str) -> None:
     except BaseException:  # also if the user interrupts the reading
         path.unlink()
         raise
-
-
-@dataclass(frozen=True)
-class ImportRequest(ImportOptions):
-    """Logs to be described, with what the user states about them.
-
-    Attributes:
-        logs: Files of one run, or folders with the files of one run each.
-        model: Model file of the robot, MJCF or URDF.
-        out: Path NAME.toml of a new file.
-    """
-
-    logs: Logs
-    model: str | Path
-    out: str | Path
-
-
-@takes_options(ImportRequest)
-def import_logs(options: ImportRequest) -> ImportResult:
-    """Write a description (TOML) of a robot's raw logs, so that all commands can read them.
-
-    Args:
-        options: Arguments, the attributes of `ImportRequest` and, by name, those of
-            `bench.logs.importing.import_result.ImportOptions`.
-
-    Returns:
-        The guesses, the columns that were left out, and what to check.
-
-    Raises:
-        InputError: The logs cannot be read or contain nothing of the robot; the message is one
-            line, and nothing is written.
-    """
-    logs = [options.logs] if isinstance(options.logs, str | Path) else options.logs
-    model, path = Path(options.model), Path(options.out)
-    if path.suffix != ".toml":
-        raise InputError(f"expected a description to write, NAME.toml, found '{path}'")
-    check_absent([path])
-    paths = [Path(log) for log in logs]
-    result = describe_logs(paths, read_robot(model), model, path.parent, options)
-    write_checked_description(path, result.text)
-    return result

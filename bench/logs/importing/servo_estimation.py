@@ -19,7 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.logs.importing.run_logs import RunLogs, hold_signal
+from bench.logs.importing.signal_assignment import SignalAssignment
 from sims.core.simulator import Array
+from sims.robot.dynamics.joint_scales import compute_joint_scales
 from sims.robot.robot_model import Joint
 
 FREQUENCY_GRID = np.geomspace(2.0, 200.0, 33)
@@ -69,7 +72,67 @@ class AddedServo(NamedTuple):
     is_free: bool
 
 
-def estimate_added_servo(
+def estimate_added_servos(logs: RunLogs, signals: SignalAssignment) -> list[AddedServo]:
+    """Estimate the gains of all servos that are missing in the model file.
+
+    Args:
+        logs: Files of the runs.
+        signals: Columns that were assigned to channels and inputs, with the missing servos.
+    """
+    if not signals.added_servos:
+        return []
+    inertia = compute_joint_scales(signals.robot).inertia
+    return [
+        _estimate_gains(
+            name,
+            joint,
+            float(inertia[signals.joints.index(joint)]),
+            _collect_servo_samples(logs, signals, name, joint),
+        )
+        for name, joint in signals.added_servos.items()
+    ]
+
+
+def _collect_servo_samples(
+    logs: RunLogs, signals: SignalAssignment, name: str, joint: Joint
+) -> list[tuple[Array, Array, Array]]:
+    """Collect times (s), commands and positions (T,) of a servo in each run, in rad or m.
+
+    A command holds until the next one, since it has other sample times than the position. Runs
+    without one of them are left out.
+
+    Args:
+        logs: files of the runs.
+        signals: columns that were assigned to channels and inputs.
+        name: name of the servo.
+        joint: joint that it drives.
+
+    Returns:
+        One triple per run; none without a recorded position.
+    """
+    command = signals.inputs[f"u.{name}"]
+    position = signals.get_position(joint.name)
+    samples: list[tuple[Array, Array, Array]] = []
+    if position is None:
+        return samples
+    for run in logs.runs:
+        command_samples = logs.read(run, command.column)
+        measured = logs.read(run, position.column)
+        if command_samples is None or measured is None:
+            continue
+        times, values = measured
+        held_command = hold_signal(*command_samples, times)
+        samples.append(
+            (
+                times,
+                command.convert(joint.unit, held_command),
+                position.convert(joint.unit, values),
+            )
+        )
+    return samples
+
+
+def _estimate_gains(
     name: str, joint: Joint, inertia: float, runs: Sequence[tuple[Array, Array, Array]]
 ) -> AddedServo:
     """Estimate the gains kp and kv of a servo that is missing in the model file.
@@ -79,10 +142,10 @@ def estimate_added_servo(
     a typical servo is taken.
 
     Args:
-        name: Name that the servo gets.
-        joint: Joint that it drives.
-        inertia: Inertia about the joint, kg m^2, or kg for a slide joint.
-        runs: For each run, times (T,) in s, commands (T,) and positions (T,), rad or m.
+        name: name that the servo gets.
+        joint: joint that it drives.
+        inertia: inertia about the joint, kg m^2, or kg for a slide joint.
+        runs: for each run, times (T,) in s, commands (T,) and positions (T,), rad or m.
     """
     estimate = estimate_servo_response(runs)
     response = estimate or DEFAULT_RESPONSE

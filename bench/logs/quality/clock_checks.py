@@ -1,7 +1,7 @@
 """Check the clock of a recording: jitter, lost samples, impossible stamps, drift of the sensors.
 
-The time in which a coordinate moves is estimated twice. From the recording: the shortest lag T
-after which its values x differ by as much as their spread,
+To find time stamps in a wrong unit, the time in which a coordinate moves is estimated twice. From
+the recording: the shortest lag T after which its values x differ by as much as their spread,
 
     mean (x(t + T) - x(t))^2 >= var x                                      (1)
 
@@ -14,19 +14,20 @@ with its acceleration a at nominal parameters. An oscillation has T = 1.05/w and
 friction and a wrong mass change the ratio a few times, milliseconds read as seconds a thousand
 times; then the sampling interval exceeds (2), too, which nobody would record on purpose.
 
-The response of a position y to a command u is modelled as linear with finite memory,
+To find a drift of the sensors, the response of a position y to a command u is modelled as linear
+with finite memory,
 
-    p(t) = c + d t + sum_k h_k <u>_k(t),  <u>_k the mean of u over the k-th interval before t  (1)
+    p(t) = c + d t + sum_k h_k <u>_k(t),  <u>_k the mean of u over the k-th interval before t  (3)
 
 so that slow and fast commands each have the lag that the drive gives them. A position whose delay
 grows by a share e of the time is
 
-    y(t) = p(t - T - e t) = p - (T + e t) p' + ...                                             (2)
+    y(t) = p(t - T - e t) = p - (T + e t) p' + ...                                             (4)
 
 Least squares for T and e finds the shift at which the two are most similar (the maximum of the
 cross-correlation, to first order; C. Knapp, G. Carter, IEEE Trans. ASSP 24(4), 320, 1976). The
 standard error of e is computed from sums over blocks longer than the memory, since the residual of
-(1) is not white (W. Newey, K. West, Econometrica 55, 703, 1987).
+(3) is not white (W. Newey, K. West, Econometrica 55, 703, 1987).
 """
 
 from __future__ import annotations
@@ -218,7 +219,7 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     system = kind.system()
     interval = float(np.median(np.diff(run.times)))
     if kind.has_model:
-        accelerations = compute_static_accelerations(run, kind)
+        accelerations = _compute_static_accelerations(run, kind)
     else:
         accelerations = _compute_rest_accelerations(recording, run, system)
     # A servo holds its position by force, so large forces at rest are normal.
@@ -325,6 +326,35 @@ def _compute_rest_accelerations(recording: Recording, run: Run, system: System) 
     return accelerations
 
 
+def _compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
+    """Compute accelerations of a robot at rest in recorded positions under recorded commands.
+
+    They show how fast the robot could move, by which time stamps in a wrong unit are found.
+
+    Args:
+        run: run of the robot.
+        kind: simulator class of the robot.
+
+    Returns:
+        (N, D) accelerations of the D joints with one coordinate, at N times of the run, at most
+        `CHECKED_INSTANTS`.
+    """
+    # This import is needed for robots only.
+    from sims.robot.contact_pairs import iterate_poses
+
+    joints = [
+        joint
+        for joint in kind.robot.joints  # type: ignore[attr-defined]
+        if joint.has_one_coordinate
+    ]
+    return np.array(
+        [
+            [data.qacc[joint.velocity] for joint in joints]
+            for data in iterate_poses(kind, run.channels, run.inputs)
+        ]
+    )
+
+
 def _estimate_lag(x: Array) -> float:
     """Estimate the shortest lag in samples after which values differ by their spread.
 
@@ -349,7 +379,7 @@ def _estimate_lag(x: Array) -> float:
 MAX_COMPARED_INSTANTS = 8000
 """Maximum number of times of a run at which command and position are compared."""
 LAG_BIN_EDGES = (-2, -1, 0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
-"""Bounds of the intervals of equation (1), in grid steps before the time considered."""
+"""Bounds of the intervals of equation (3), in grid steps before the time considered."""
 BLOCK_COUNT = 4
 """Minimum number of blocks of a run for estimating the standard error of its drift."""
 STUDENT_T_FACTORS = (
@@ -377,9 +407,9 @@ They are the factors by which an error from few blocks is too small (Student's t
 lost).
 """
 MODEL_ERROR_SHARE = 0.01
-"""Relative error of the drift from truncating equation (2)."""
+"""Relative error of the drift from truncating equation (4)."""
 MIN_EXPLAINED_VARIANCE = 0.9
-"""Minimum share of a position's variance that equation (1) must explain."""
+"""Minimum share of a position's variance that equation (3) must explain."""
 MIN_REPORTED_DRIFT = 2e-5
 """Smallest reported drift (dimensionless); ordinary quartz clocks differ by less."""
 
@@ -445,10 +475,10 @@ def _list_driven_positions(kind: type[Simulator]) -> list[tuple[str, str]]:
 def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Estimate]:
     """Estimate the drift of the sensors' clock against the commands' clock in one run.
 
-    1. The position is predicted from past commands, p(t) = c + d t + sum_k h_k <u>_k(t) (1), where
+    1. The position is predicted from past commands, p(t) = c + d t + sum_k h_k <u>_k(t) (3), where
        <u>_k is the mean command over the k-th interval before t.
     2. A delay T that grows by a share e of the time, the drift, gives y(t) = p - (T + e t) p' to
-       first order (2). So e is estimated by least squares from the part of y that is proportional
+       first order (4). So e is estimated by least squares from the part of y that is proportional
        to t times the velocity p'.
 
     Nothing is yielded if the run is short, or the commands explain too little of the motion;
@@ -476,7 +506,7 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
         return
     regressors = np.column_stack([np.ones_like(time), time, past_command_means])
     coefficients, *_ = np.linalg.lstsq(regressors, positions, rcond=1e-10)
-    predicted = regressors @ coefficients  # Equation (1).
+    predicted = regressors @ coefficients  # Equation (3).
     if np.var(positions - predicted) > (1.0 - MIN_EXPLAINED_VARIANCE) * np.var(positions):
         return
     estimate = _fit_drift(time, positions, regressors, np.gradient(predicted, step))
@@ -489,14 +519,14 @@ def _fit_drift(
 ) -> _Estimate | None:
     """Fit the drift e, the growth of a delay per time, to a position by least squares.
 
-    To first order, the position changes by -e t p' (2), with the predicted velocity p'. What the
+    To first order, the position changes by -e t p' (4), with the predicted velocity p'. What the
     regressors and a constant delay (the velocity) explain must not count as drift: only the part of
     -t p' that is orthogonal to both determines it.
 
     Args:
         time: (N,) times of the N samples about their mean, s.
         positions: (N,) recorded positions.
-        regressors: (N, K) K columns by which the commands explain the position, equation (1).
+        regressors: (N, K) K columns by which the commands explain the position, equation (3).
         velocity: (N,) velocity p' that the commands predict.
 
     Returns:
@@ -510,7 +540,7 @@ def _fit_drift(
         return None
     drift = float(delay_response @ positions) / response_power
     residual = positions - basis @ (basis.T @ positions) - drift * delay_response
-    # The residual is autocorrelated, but hardly over more than the memory of (1): sums over blocks
+    # The residual is autocorrelated, but hardly over more than the memory of (3): sums over blocks
     # of that length are independent, and their scatter gives the standard error.
     block_sums = np.add.reduceat(
         delay_response * residual, np.arange(0, time.size, LAG_BIN_EDGES[-1])
@@ -518,7 +548,7 @@ def _fit_drift(
     # The error from few blocks is too small by this factor.
     student_factor = STUDENT_T_FACTORS[min(len(block_sums), len(STUDENT_T_FACTORS) - 1)]
     error = student_factor * float(np.sqrt(block_sums @ block_sums)) / response_power
-    # The truncation of (2) adds an error in proportion to the drift.
+    # The truncation of (4) adds an error in proportion to the drift.
     return _Estimate(drift, float(np.hypot(error, MODEL_ERROR_SHARE * drift)))
 
 
@@ -562,32 +592,3 @@ def _pool_estimates(estimates: list[_Estimate]) -> _Estimate:
         reduced_chi_squared = float(weights @ (drifts - drift) ** 2) / (len(estimates) - 1)
         error *= max(reduced_chi_squared, 1.0) ** 0.5
     return _Estimate(drift, error)
-
-
-def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
-    """Compute accelerations of a robot at rest in recorded positions under recorded commands.
-
-    They show how fast the robot could move, by which time stamps in a wrong unit are found.
-
-    Args:
-        run: Run of the robot.
-        kind: Simulator class of the robot.
-
-    Returns:
-        (N, D) accelerations of the D joints with one coordinate, at N times of the run, at most
-        `CHECKED_INSTANTS`.
-    """
-    # This import is needed for robots only.
-    from sims.robot.contact_pairs import iterate_poses
-
-    joints = [
-        joint
-        for joint in kind.robot.joints  # type: ignore[attr-defined]
-        if joint.has_one_coordinate
-    ]
-    return np.array(
-        [
-            [data.qacc[joint.velocity] for joint in joints]
-            for data in iterate_poses(kind, run.channels, run.inputs)
-        ]
-    )

@@ -20,7 +20,6 @@ from bench.logs.quality import (
     velocity_checks,
 )
 from bench.logs.quality.quality_finding import Anomaly, QualityFinding
-from bench.logs.quality.range_checks import list_exceeded_ranges
 from sims.core.simulator import InputError, Simulator
 from sims.recording.recording import Recording
 
@@ -103,7 +102,7 @@ def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator
         return
     robot = cast("type[RobotSimulator]", kind).robot
     yield from _list_missing_signals(recording, robot)
-    yield from list_exceeded_ranges(recording, robot)
+    yield from range_checks.list_exceeded_ranges(recording, robot)
 
 
 def _list_missing_signals(recording: Recording, robot: RobotModel) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Check the recorded poses of a robot: contacts, overlaps, and initial poses of floating bodies.
+"""Check the recorded poses of a robot: overlaps, and missing initial poses of floating bodies.
 
 Initial poses are not estimated, and the same commands produce a different motion from a different
 initial pose.

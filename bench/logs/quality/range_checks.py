@@ -1,4 +1,8 @@
-"""Check recorded positions, forces and commands of a robot against the ranges of its model file."""
+"""Check the size of recorded values.
+
+Positions, forces and commands of a robot are compared with the ranges of its model file. The values
+of any recording must be small enough for computing with their squares.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +14,12 @@ import numpy as np
 
 from bench.logs.quality.quality_finding import Anomaly
 from sims.core.number_limits import MAX_NUMBER
-from sims.core.simulator import InputError, Simulator
+from sims.core.simulator import Array, InputError, Simulator
 from sims.recording.recording import Recording
 
 if TYPE_CHECKING:  # A recording without a robot needs no model.
     from sims.robot.robot_model import Joint, RobotModel
+
 
 MAX_RANGE_EXCESS = 1.0
 """Maximum plausible distance of a position beyond its joint's range, as a fraction of the range."""
@@ -24,6 +29,11 @@ MAX_PLAUSIBLE_TURNS = 8.0
 """Maximum plausible number of turns of a joint without limits."""
 _SMALLER_UNITS = {"rad": (np.pi / 180.0, "degrees"), "m": (1e-3, "millimetres")}
 """Smaller unit in which positions are often recorded, by SI unit: its value and name."""
+
+LIMIT_TOLERANCE = 0.01
+"""Tolerance beyond a limit, as a fraction of the range, for soft limits and encoder offsets."""
+MAX_NAMED_RUNS = 4
+"""Maximum number of runs that are named in one line."""
 
 
 def check_joint_ranges(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
@@ -71,9 +81,7 @@ def _check_joint_range(recording: Recording, joint: Joint) -> Iterator[Anomaly]:
                 return
             continue
         low, high = joint.range
-        tolerance = MAX_RANGE_EXCESS * (high - low)
-        widened_low, widened_high = low - tolerance, high + tolerance
-        if widened_low <= lowest and highest <= widened_high:
+        if is_within_widened_range((lowest, highest), joint.range, MAX_RANGE_EXCESS):
             # Plausible, but perhaps slightly beyond one end of the range.
             excess, limit, reached = max(
                 (low - lowest, low, lowest), (highest - high, high, highest), key=itemgetter(0)
@@ -85,9 +93,8 @@ def _check_joint_range(recording: Recording, joint: Joint) -> Iterator[Anomaly]:
                 return
             continue
         # Suggest the smaller unit if the numbers, read in that unit, lie within the limits.
-        is_smaller_unit = (
-            widened_low <= smaller_unit * lowest and smaller_unit * highest <= widened_high
-        )
+        converted_extremes = smaller_unit * lowest, smaller_unit * highest
+        is_smaller_unit = is_within_widened_range(converted_extremes, joint.range, MAX_RANGE_EXCESS)
         doubt = f"is the unit {smaller_unit_name}?" if is_smaller_unit else "is the unit right?"
         message = f"expected within {low:.4g} to {high:.4g} {unit}, the joint's range"
         yield Anomaly(
@@ -96,10 +103,20 @@ def _check_joint_range(recording: Recording, joint: Joint) -> Iterator[Anomaly]:
         return
 
 
-LIMIT_TOLERANCE = 0.01
-"""Tolerance beyond a limit, as a fraction of the range, for soft limits and encoder offsets."""
-MAX_NAMED_RUNS = 4
-"""Maximum number of runs that are named in one line."""
+def is_within_widened_range(
+    extremes: tuple[float, float] | Array, limits: tuple[float, float], share: float
+) -> bool:
+    """Return whether positions lie within a joint's range, widened at both ends by a share of it.
+
+    Args:
+        extremes: Lowest and highest position.
+        limits: Range of the joint, in the same unit.
+        share: Width by which each end is moved outwards, as a fraction of the range.
+    """
+    lowest, highest = extremes
+    low, high = limits
+    slack = share * (high - low)
+    return bool(low - slack <= lowest and highest <= high + slack)
 
 
 def list_exceeded_ranges(recording: Recording, robot: RobotModel) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Check whether the joints of a robot follow the commands of their position servos.
+"""Check whether joints follow the commands of their servos, and whether the commands are recorded.
 
 The joint of a servo approximately follows its command: over the samples of all runs, with the
 command u and the position q about their means,
@@ -7,6 +7,9 @@ command u and the position q about their means,
 
 are the slope and the correlation. They reveal wrong units (degrees), reversed signs and exchanged
 columns.
+
+A log that contains a measurement in place of the command does not contain the command at all; the
+column with the highest correlation r to the position may be the true command.
 """
 
 from __future__ import annotations
@@ -37,10 +40,10 @@ DEGREE_SLOPE_RANGE = (40.0, 80.0)
 UNKNOWN_COLUMN = "NAME OF ITS COLUMN"
 """Stands for the column of a command where no column of the log can be it."""
 
-MIN_SAMPLES = 20
+MIN_COMPARED_SAMPLES = 20
 """Minimum number of samples, and of different values, that are compared."""
 
-MIN_CORRELATION = 0.9
+MIN_COMMAND_CORRELATION = 0.9
 """Minimum correlation of a position with the column that may be its command."""
 
 MEASURED_QUANTITIES = {"position": "q", "velocity": "qd"}
@@ -179,7 +182,7 @@ def find_copied_commands(
         is_recorded = np.isfinite(measured_values)
         command_values, measured_values = command_values[is_recorded], measured_values[is_recorded]
         # The readings of a joint that hardly moves may equal its command anyway.
-        if len(np.unique(measured_values)) >= MIN_SAMPLES and np.array_equal(
+        if len(np.unique(measured_values)) >= MIN_COMPARED_SAMPLES and np.array_equal(
             command_values, measured_values
         ):
             yield command, channel, _find_likely_column(recording, channel)
@@ -207,7 +210,7 @@ def _find_likely_column(recording: Recording, channel: str) -> str:
     channel_table = meta.get("channels", {}).get(channel, {})
     # Without a stated column, the column has the name of the channel.
     position_column, *_ = _list_columns(channel_table) or [channel]
-    best, best_correlation = UNKNOWN_COLUMN, MIN_CORRELATION
+    best, best_correlation = UNKNOWN_COLUMN, MIN_COMMAND_CORRELATION
     # The first log with the position decides.
     for log in _iterate_logs(description):
         if position_column not in log.list_columns():
@@ -241,7 +244,8 @@ def _iterate_logs(description: Path) -> Iterator[LogFile]:
 def _compute_correlation(u: Array, y: Array) -> float:
     """Return the correlation of two columns; 0 if they are equal, or one does not change.
 
-    It is also 0 if the columns have different lengths or fewer than `MIN_SAMPLES` common samples.
+    It is also 0 if the columns have different lengths, or fewer than `MIN_COMPARED_SAMPLES` samples
+    in common.
 
     Args:
         u: (T,) first column, NaN where missing.
@@ -252,6 +256,6 @@ def _compute_correlation(u: Array, y: Array) -> float:
         return 0.0
     is_recorded = np.isfinite(u) & np.isfinite(y)
     u, y = u[is_recorded], y[is_recorded]
-    if u.size < MIN_SAMPLES or np.ptp(u) == 0 or np.ptp(y) == 0:
+    if u.size < MIN_COMPARED_SAMPLES or np.ptp(u) == 0 or np.ptp(y) == 0:
         return 0.0
     return float(np.corrcoef(u, y)[0, 1])

@@ -1,4 +1,4 @@
-"""Check single signals: quantisation, saturation and standstill."""
+"""Check signals: quantisation, saturation, standstill, and samples that repeat the previous one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run a batch on the compiled kernel: group elements by active effects and prepare arrays."""
+"""Run a batch on the compiled engine: group elements by active effects and prepare arrays."""
 
 from __future__ import annotations
 
@@ -80,6 +80,45 @@ def integrate_batch(
             records = arrays.records.reshape(len(elements), record_count, 3, -1)
             trajectories[elements] = records[..., : batch.x.shape[1]]
     return Trajectories(*np.moveaxis(trajectories, 2, 0))
+
+
+def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
+    """Group the elements by their active effects, since each group needs its own force program.
+
+    Only effects that are part of a force program count: forces, friction, contact laws and hidden
+    states. An effect is active in an element if its coefficients there are not all zero; one with a
+    hidden state is off, by definition, unless its first coefficient is above zero.
+
+    Args:
+        batch: batch of L elements, with the K coefficients (K, L, 1) of their effects.
+
+    Returns:
+        Indices (n,) of each group's elements, and its effects with coefficients (K, L, 1).
+    """
+    effects: list[tuple[Effect, Array]] = [
+        (e, c)
+        for e, c in batch.effects
+        if isinstance(e, Force | Friction | Contact | HiddenStateEffect)
+    ]
+    if not effects:
+        return [(np.arange(len(batch.x)), [])]
+    # (L, number of effects): whether each effect acts in each element.
+    patterns = np.stack(
+        [
+            c[0, :, 0] > 0 if isinstance(e, HiddenStateEffect) else is_active(c)[:, 0]
+            for e, c in effects
+        ],
+        axis=1,
+    )
+    # Most calls have one group, and NumPy's search for equal rows costs as much as a few elements.
+    if (patterns == patterns[0]).all():
+        groups = [np.arange(len(patterns))]
+    else:
+        elements_of: dict[bytes, list[int]] = {}
+        for element, pattern in enumerate(patterns):
+            elements_of.setdefault(pattern.tobytes(), []).append(element)
+        groups = [np.array(members) for members in elements_of.values()]
+    return [(members, list(compress(effects, patterns[members[0]]))) for members in groups]
 
 
 def _make_arrays(
@@ -172,6 +211,30 @@ def _integrate_group(program: ForceProgram, arrays: BatchArrays, jobs: int) -> N
         run(arrays)
 
 
+def integrate_elements(
+    program: ProgramArrays,
+    arrays: BatchArrays,
+    buffers: BlockBuffers,
+    w: int,
+) -> None:
+    """Integrate all elements of a batch.
+
+    Args:
+        program: program of the system and its effects.
+        arrays: batch of elements.
+        buffers: buffers of the slots, each of which holds one batch element at a time.
+        w: number of slots in use.
+
+    Raises:
+        ValueError: an array is not as specified.
+    """
+    # `Block` has its integers last, and `steps_per_record` is the last field of `arrays`.
+    fields: tuple[Any, ...] = *program, *arrays[:-1], *buffers, arrays.steps_per_record, w
+    block = Block(*fields)
+    check_block(block)
+    COMPILED.bind(step_elements, *block)()
+
+
 def _select_elements(arrays: BatchArrays, places: Indices) -> BatchArrays:
     """Return the arrays with the elements at these places of their order."""
     if len(places) == len(arrays.order) and (places == np.arange(len(places))).all():
@@ -221,66 +284,3 @@ def _get_ground_parameters(batch: IntegrationBatch) -> Array:
         if grip is not None:
             ground[MIN_REMAINING_SHARE] = 1.0 - _to_column(grip, count)
     return ground
-
-
-def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
-    """Group the elements by their active effects, since each group needs its own force program.
-
-    Only effects that are part of a force program count: forces, friction, contact laws and hidden
-    states. An effect is active in an element if its coefficients there are not all zero; one with a
-    hidden state is off, by definition, unless its first coefficient is above zero.
-
-    Args:
-        batch: batch of L elements, with the K coefficients (K, L, 1) of their effects.
-
-    Returns:
-        Indices (n,) of each group's elements, and its effects with coefficients (K, L, 1).
-    """
-    effects: list[tuple[Effect, Array]] = [
-        (e, c)
-        for e, c in batch.effects
-        if isinstance(e, Force | Friction | Contact | HiddenStateEffect)
-    ]
-    if not effects:
-        return [(np.arange(len(batch.x)), [])]
-    # (L, number of effects): whether each effect acts in each element.
-    patterns = np.stack(
-        [
-            c[0, :, 0] > 0 if isinstance(e, HiddenStateEffect) else is_active(c)[:, 0]
-            for e, c in effects
-        ],
-        axis=1,
-    )
-    # Most calls have one group, and NumPy's search for equal rows costs as much as a few elements.
-    if (patterns == patterns[0]).all():
-        groups = [np.arange(len(patterns))]
-    else:
-        elements_of: dict[bytes, list[int]] = {}
-        for element, pattern in enumerate(patterns):
-            elements_of.setdefault(pattern.tobytes(), []).append(element)
-        groups = [np.array(members) for members in elements_of.values()]
-    return [(members, list(compress(effects, patterns[members[0]]))) for members in groups]
-
-
-def integrate_elements(
-    program: ProgramArrays,
-    arrays: BatchArrays,
-    buffers: BlockBuffers,
-    w: int,
-) -> None:
-    """Integrate all elements of a batch.
-
-    Args:
-        program: program of the system and its effects.
-        arrays: batch of elements.
-        buffers: buffers of the slots, each of which holds one batch element at a time.
-        w: number of slots in use.
-
-    Raises:
-        ValueError: an array is not as specified.
-    """
-    # `Block` has its integers last, and `steps_per_record` is the last field of `arrays`.
-    fields: tuple[Any, ...] = *program, *arrays[:-1], *buffers, arrays.steps_per_record, w
-    block = Block(*fields)
-    check_block(block)
-    COMPILED.bind(step_elements, *block)()

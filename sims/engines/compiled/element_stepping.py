@@ -23,7 +23,8 @@ the ripples of a fast motor) are rejected and shortened, and steps that contain 
 although elements need different numbers of steps. The result of an element does not depend on any
 other.
 
-Compiled functions of the batch engine: integration of a batch, and instructions on registers.
+`COMPILED` is the machine code of the batch engine: `step_elements`, and `run_instructions` of
+`interpreter`, with which a program also runs alone.
 """
 
 from __future__ import annotations
@@ -244,16 +245,6 @@ def accept_or_retry(block: Block, i: int) -> None:
         next_step(block, i)
 
 
-COMPILED = CompiledFunctions(
-    __name__,
-    "the batch engine",
-    {
-        step_elements: BLOCK_SHAPES,
-        run_instructions: ("#i5", "#", "#", "rw", "#"),
-    },
-)
-
-
 def next_step(block: Block, i: int) -> None:
     """Begin the next planned step of the element in slot i, with the inputs of that step.
 
@@ -279,3 +270,14 @@ def next_step(block: Block, i: int) -> None:
     a[T, i] = a[STEP_START, i]
     a[REMAINING_TIME, i] = block.steps[row, step] if step < block.steps.shape[1] else 0.0
     set_inputs(block, i)
+
+
+COMPILED = CompiledFunctions(
+    __name__,
+    "the batch engine",
+    {
+        step_elements: BLOCK_SHAPES,
+        run_instructions: ("#i5", "#", "#", "rw", "#"),
+    },
+)
+"""Machine code of the batch engine."""

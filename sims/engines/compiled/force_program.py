@@ -73,7 +73,7 @@ class ForceProgram(NamedTuple):
     flags: IntTable
 
     def prepare(self, width: int) -> tuple[PreparedProgram, ProgramArrays]:
-        """Allocate registers of `width` slots, and return the layout for the compiled kernel."""
+        """Allocate registers of `width` slots, and return the layout for the compiled engine."""
         prepared = PreparedProgram(self.program, width)
         (force, _), _ = self.program.outputs
         return prepared, ProgramArrays(

@@ -1,14 +1,4 @@
-"""Impacts of the elements of a block with the ground, and the end of their bouncing.
-
-The laws of impacts are below. After the step to the time of an
-impact that `events` estimates, with the height d above the ground, its rate r and its acceleration
-a, the impact is
-
-    s = -d / r (1 + d a / (2 r^2))                                         (10)
-
-seconds away, which solves d + r s + a s^2 / 2 = 0 up to terms of third order in d.
-
-Impacts with level ground: velocity after an impact, and end of bouncing.
+"""Impacts of elements with level ground: velocity after an impact, and end of bouncing.
 
 The last coordinate strikes the ground at its `floor`; the others are tangential. Restitution e is
 the system's, modified by the contact effects in their order. With the normal speed n and the
@@ -33,6 +23,13 @@ have impact speeds n', e n', e^2 n', ..., and the tangential speed that they wou
 at once:
 
     mu (1 + e) (n' + e n' + e^2 n' + ...) = mu (1 + e) n' / (1 - e)        (4)
+
+The time of an impact is that of `events`, which is an estimate. After the step to it, with the
+height d above the ground, its rate r and its acceleration a, the impact is
+
+    s = -d / r (1 + d a / (2 r^2))                                         (5)
+
+seconds away, which solves d + r s + a s^2 / 2 = 0 up to terms of third order in d.
 """
 
 from __future__ import annotations
@@ -128,7 +125,7 @@ def handle_impact(block: Block, i: int, k: int) -> None:
     """Apply an impact with the ground, which the element has nearly reached.
 
     First the element moves exactly to the ground: with its height d above the ground, the rate r of
-    d and the upward acceleration a, the impact is -d / r (1 + d a / (2 r^2)) seconds away (10).
+    d and the upward acceleration a, the impact is -d / r (1 + d a / (2 r^2)) seconds away (5).
     Then its velocity becomes that of the rebound.
 
     Args:
@@ -150,7 +147,7 @@ def handle_impact(block: Block, i: int, k: int) -> None:
     correction = 0.0
     if rate < 0.0:
         correction = (floor - a[height_row, i]) / rate
-        correction *= 1.0 - 0.5 * correction * upward_acceleration / rate  # (10)
+        correction *= 1.0 - 0.5 * correction * upward_acceleration / rate  # (5)
     correction = shift_time(block, i, correction)
     for j in range(d):
         acceleration = a[k + j, i]

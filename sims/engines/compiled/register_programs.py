@@ -198,6 +198,31 @@ class PreparedProgram:
                 self.r[rows] = np.nan
 
 
+def make_instruction_runner(
+    code: IntTable, first: int, last: int, r: FloatArray
+) -> Callable[[], None]:
+    """Return a function that runs instructions on the present values of the registers.
+
+    Machine code does not check array bounds, so the instructions are checked once, here.
+
+    Args:
+        code: (n, 5) n instructions; see `ProgramArrays`.
+        first: index of the first instruction.
+        last: index after the last instruction.
+        r: (registers, W) registers of W slots.
+
+    Returns:
+        The function without arguments.
+
+    Raises:
+        ValueError: an instruction uses a register that does not exist.
+    """
+    run = COMPILED.bind(run_instructions, code, first, last, r, r.shape[1])
+    if not (0 <= first <= last <= len(code) and uses_registers(code, len(r))):
+        raise ValueError("the instructions are not for these registers")
+    return run
+
+
 def make_numpy_program(function: ArrayFunction) -> Program:
     """Return a program whose instructions call the function, one for each part.
 
@@ -378,28 +403,3 @@ def check_program(function: ArrayFunction, samples: Iterable[Array]) -> None:
                 equal_nan=True,
             ):
                 raise NotTraceableError("its compiled form gives other numbers")
-
-
-def make_instruction_runner(
-    code: IntTable, first: int, last: int, r: FloatArray
-) -> Callable[[], None]:
-    """Return a function that runs instructions on the present values of the registers.
-
-    Machine code does not check array bounds, so the instructions are checked once, here.
-
-    Args:
-        code: (n, 5) n instructions; see `ProgramArrays`.
-        first: index of the first instruction.
-        last: index after the last instruction.
-        r: (registers, W) registers of W slots.
-
-    Returns:
-        The function without arguments.
-
-    Raises:
-        ValueError: an instruction uses a register that does not exist.
-    """
-    run = COMPILED.bind(run_instructions, code, first, last, r, r.shape[1])
-    if not (0 <= first <= last <= len(code) and uses_registers(code, len(r))):
-        raise ValueError("the instructions are not for these registers")
-    return run

@@ -12,7 +12,7 @@ run; the first command.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -139,6 +139,51 @@ def select_initial_activations(robot: RobotModel, initial: Mapping[str, float]) 
     """
     activation_names = {one_filter.state for one_filter in activation_filters(robot)}
     return {name: value for name, value in initial.items() if name in activation_names}
+
+
+def compute_initial_activation(
+    activation_filter: ActivationFilter,
+    scenario: Scenario,
+    controls: Array,
+    step: float,
+    is_rk4: bool,
+    compute_inputs: Callable[[Scenario, int], Mapping[str, Array]],
+) -> Array:
+    """Return the activation (n,) of a filter at the start of a run, for n batch elements.
+
+    It is the first of these that is known:
+
+    1. the value that the recording states,
+    2. the result of the filter for the commands before the run,
+    3. the output of a filter that has settled at the first command.
+
+    Args:
+        activation_filter: filter: its actuator, time constant and kind.
+        scenario: scenario of the run.
+        controls: (n, S) controls of the filter in the S steps of the run.
+        step: step length in seconds.
+        is_rk4: whether the integrator is Runge-Kutta 4.
+        compute_inputs: function that returns the applied inputs (n, S) by name of a scenario, in
+            the first S steps of it.
+    """
+    # 1. Stated value, by the filter's name among the initial states.
+    if activation_filter.state in scenario.initial:
+        return np.full(len(controls), scenario.initial[activation_filter.state])
+    # 3. Without known commands before the run, the filter has settled.
+    history = extend_into_past(scenario, step)
+    if history is None:
+        settled_activation: Array = np.clip(
+            activation_filter.clip_controls(controls[:, 0]), *activation_filter.limits
+        )
+        return settled_activation
+    # 2. The filter has settled at the first of the commands before the run.
+    earlier_controls = compute_inputs(*history)[f"u.{activation_filter.actuator.name}"]
+    first_activation = activation_filter.clip_controls(earlier_controls[:, 0])
+    activations = activation_filter.compute_activations(
+        earlier_controls, first_activation, step, is_rk4
+    )
+    last_activation: Array = activations[:, -1]
+    return last_activation
 
 
 def extend_into_past(scenario: Scenario, step: float) -> tuple[Scenario, int] | None:

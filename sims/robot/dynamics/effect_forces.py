@@ -1,4 +1,4 @@
-"""Evaluate effects on a batch of robots: forces, limits of dry friction and hidden states."""
+"""Evaluate effects on a batch of robots: forces and limits of dry friction."""
 
 from __future__ import annotations
 

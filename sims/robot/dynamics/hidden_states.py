@@ -1,4 +1,4 @@
-"""Integration of hidden states of effects, such as the deflection of bristles in a friction model.
+"""Hidden states of effects, such as the deflection of bristles in a friction model: integration.
 
 The rate r(w) of a state is linearised in w over a step h, so that stiff states are integrated
 exactly:
@@ -31,6 +31,41 @@ LINEARITY_TOLERANCE = 1e-9
 
 STATE_STEP = 1e-6
 """Step of the state variable for the finite-difference derivative of its rate."""
+
+
+def compute_hidden_state_forces(
+    hidden: Sequence[tuple[HiddenStateEffect, Array]],
+    snapshots: tuple[RobotSnapshot, RobotSnapshot],
+    states: Sequence[HiddenState],
+    step: float,
+) -> tuple[Array, list[HiddenState]]:
+    """Advance hidden states of effects, and compute their forces afterwards.
+
+    A hidden state is a variable that an effect has in addition to the state of the robot, such as
+    the deflection of bristles in a friction model. In batch elements in which the first coefficient
+    of an effect is not above zero, it exerts no force.
+
+    Shapes: L batch elements, D joints, K coefficients.
+
+    Args:
+        hidden: effects with their coefficients (K, L, 1).
+        snapshots: snapshots during the interval, with which the states advance; and at its end, at
+            which the forces are evaluated.
+        states: hidden states of the effects at the beginning.
+        step: length of the interval in seconds.
+
+    Returns:
+        Total force (L, D) and hidden states at the end of the interval.
+    """
+    during, end = snapshots
+    total = np.zeros_like(end.x)
+    later_states = []
+    for (effect, c), state in zip(hidden, states, strict=True):
+        after = advance_state(effect, c, during, state, step)
+        force, _ = effect.act(c, end, after)  # the rate of the state is not needed here
+        total = total + np.where(c[0] > 0, force, 0.0)
+        later_states.append(after)
+    return total, later_states
 
 
 def advance_state(
@@ -135,38 +170,3 @@ def _integrate_linear_state(state: HiddenState, change_at_zero: Array, z: Array)
         values.append(w)
     v = np.array(values)[:, None]
     return HiddenState(np.zeros_like(v) + state.x, v)
-
-
-def compute_hidden_state_forces(
-    hidden: Sequence[tuple[HiddenStateEffect, Array]],
-    snapshots: tuple[RobotSnapshot, RobotSnapshot],
-    states: Sequence[HiddenState],
-    step: float,
-) -> tuple[Array, list[HiddenState]]:
-    """Advance hidden states of effects, and compute their forces afterwards.
-
-    A hidden state is a variable that an effect has in addition to the state of the robot, such as
-    the deflection of bristles in a friction model. In batch elements in which the first coefficient
-    of an effect is not above zero, it exerts no force.
-
-    Shapes: L batch elements, D joints, K coefficients.
-
-    Args:
-        hidden: effects with their coefficients (K, L, 1).
-        snapshots: snapshots during the interval, with which the states advance; and at its end, at
-            which the forces are evaluated.
-        states: hidden states of the effects at the beginning.
-        step: length of the interval in seconds.
-
-    Returns:
-        Total force (L, D) and hidden states at the end of the interval.
-    """
-    during, end = snapshots
-    total = np.zeros_like(end.x)
-    later_states = []
-    for (effect, c), state in zip(hidden, states, strict=True):
-        after = advance_state(effect, c, during, state, step)
-        force, _ = effect.act(c, end, after)  # the rate of the state is not needed here
-        total = total + np.where(c[0] > 0, force, 0.0)
-        later_states.append(after)
-    return total, later_states

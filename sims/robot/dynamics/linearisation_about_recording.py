@@ -47,7 +47,7 @@ from sims.robot.dynamics.midpoint_state import IndexArray, forces_are_at_step_en
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.dynamics.tangent_propagation import Perturbation
 from sims.robot.floating_joints import FloatingJoints, FloatingState
-from sims.robot.loop_closure import follow_measured_joints
+from sims.robot.loop_closure import follow_measured_joints, list_following_joints
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_simulator import RobotSimulator
 from sims.system_simulator import SystemSimulator
@@ -270,7 +270,7 @@ class MeasuredLinear(RunLinearisation):
         """
         system, robot = self._simulator.system, self._simulator.robot
         measured = {system.coordinates[joint] for joint in self._measured}
-        following = system.list_following_joints(measured)
+        following = list_following_joints(system.robot, system.joint_loops, measured)
         if not following:
             return trajectory
         model, addresses = robot.compiled, self._simulator.addresses

@@ -31,9 +31,9 @@ from sims.robot.dynamics.sensor_sampling import (
     sample_readings,
 )
 from sims.robot.dynamics.series_joints import is_series_effect
+from sims.robot.dynamics.step_jacobians import DifferenceQuotients
 from sims.robot.dynamics.tangent_propagation import (
     MAX_SIMULTANEOUS_CHANGES,
-    DifferenceQuotients,
     Perturbation,
     TangentModel,
 )

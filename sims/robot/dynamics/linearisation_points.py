@@ -1,7 +1,7 @@
 """Robot states along one motion, for finite-difference linearisation.
 
 Each state is placed in another element of a batch. Computed are the states after a step,
-accelerations, and effect forces.
+accelerations, and effect forces. Neighbouring points are found for interpolation between them.
 """
 
 from __future__ import annotations
@@ -730,16 +730,6 @@ def _choose_points(
     return point_steps, point_of_step
 
 
-def _repeat_coefficients(acting: ActiveEffects, count: int) -> ActiveEffects:
-    """Repeat the coefficients of model-field effects for all elements of a batch.
-
-    Args:
-        acting: effects with coefficients (K, 1, 1).
-        count: number of elements.
-    """
-    return tuple((e, np.repeat(c, count, axis=1)) for e, c in select_model_field_effects(acting))
-
-
 def find_neighbours(point_steps: IndexArray, spacing: int) -> IndexArray:
     """Find the pairs of linearisation points between which values are interpolated.
 
@@ -761,3 +751,13 @@ def find_neighbours(point_steps: IndexArray, spacing: int) -> IndexArray:
     earlier = np.where(has_next, numbers, np.where(has_previous, numbers - 1, numbers))
     later = np.where(has_next, numbers + 1, numbers)
     return np.stack([earlier, later])
+
+
+def _repeat_coefficients(acting: ActiveEffects, count: int) -> ActiveEffects:
+    """Repeat the coefficients of model-field effects for all elements of a batch.
+
+    Args:
+        acting: effects with coefficients (K, 1, 1).
+        count: number of elements.
+    """
+    return tuple((e, np.repeat(c, count, axis=1)) for e, c in select_model_field_effects(acting))

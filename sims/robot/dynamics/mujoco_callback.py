@@ -1,4 +1,4 @@
-"""Compiled callback that adds the forces of effects within MuJoCo's own step.
+"""Compiled callback that adds the forces of effects within MuJoCo's own step, and its contexts.
 
 MuJoCo calls it as `mjcb_control` in each evaluation of the dynamics, after the velocity-dependent
 quantities and before the forces of actuators
@@ -7,9 +7,12 @@ run without Python. Forces and limits of dry friction are computed once in each 
 predicted middle of the step, with the position x, the velocity v and the previous acceleration a at
 its beginning (`sims.robot.dynamics.midpoint_state`, eq. (1)).
 
-The function is plain Python that the compiler accepts (`sims.engines.compiled.numba_compilation`).
-Addresses are 64-bit integers; the first number of MuJoCo's user data is the address of the
-simulation's context, zero for simulations without effects.
+The function (`add_effect_forces`) is plain Python that the compiler accepts
+(`sims.engines.compiled.numba_compilation`). Addresses are 64-bit integers; the first number of
+MuJoCo's user data is the address of the simulation's context, zero for simulations without effects.
+
+`find_callback` returns the callback if it can compute the effects of a batch, and
+`CallbackContexts` makes the contexts.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import contextlib
 import ctypes
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +36,12 @@ from sims.engines.compiled.intrinsics import (
     to_short_pointer,
 )
 from sims.engines.compiled.machine_code_cache import load_stored
-from sims.robot.dynamics.effect_force_program import StepForces
-from sims.robot.dynamics.mujoco_batch import MujocoBatch
 from sims.robot.integrator_settings import RK4_INTEGRATOR_ID
+
+# The process that compiles this module does not need these modules.
+if TYPE_CHECKING:
+    from sims.robot.dynamics.effect_force_program import StepForces
+    from sims.robot.dynamics.mujoco_batch import MujocoBatch
 
 QPOS = QVEL = QACC = QFRC_APPLIED = USERDATA = 0
 EFC_TYPE = EFC_ID = EFC_FRICTIONLOSS = IEFC_FRICTIONLOSS = MAP_EFC2IEFC = 0
@@ -48,20 +54,17 @@ DATA_FIELDS = (
     *("efc_type", "efc_id", "efc_frictionloss", "iefc_frictionloss", "map_efc2iefc"),
 )
 """Fields of `mujoco.MjData` that the callback uses."""
+LAST_FIELD = "iefc_frictionloss"
+"""Last of `DATA_FIELDS` in MuJoCo's data."""
 MAX_DATA_WORDS = 1 << 20
 """Maximum offset of a field in MuJoCo's data, in words of eight bytes."""
 EQUALITY_ROW, FRICTION_ROW = 0, 1
 """Types of rows of MuJoCo's constraints (mjtConstraint); rows are sorted by type."""
-
 MIN_FRICTION = 1e-12
 """Dry friction in N or N·m of the model where effects add friction.
 
 With it, MuJoCo makes a constraint whose limit the callback replaces.
 """
-
-LAST_FIELD = "iefc_frictionloss"
-"""Last of `DATA_FIELDS` in MuJoCo's data."""
-
 _PROBE_MODEL = """
 <mujoco><size nuserdata="1"/><worldbody><body>
 <joint name="slide" type="slide" axis="1 0 0" frictionloss="1"/><geom size="0.1" mass="1"/>
@@ -257,54 +260,6 @@ def set_friction_limits(data: Any, context: Any, limits: Any) -> None:
                 island_loss[places[row]] = limits[j]
 
 
-def load_callback(offsets: Mapping[str, int]) -> Callable[..., None]:
-    """Return the compiled callback of MuJoCo's steps, compiled on first use.
-
-    Args:
-        offsets: offset of each field in MuJoCo's data, in words of eight bytes.
-
-    Raises:
-        InputError: the compiler or its machine code cannot be used.
-    """
-    # The compiler replaces the module's constants, such as QPOS, by these offsets.
-    constants = {name.upper(): offset for name, offset in offsets.items()}
-    return load_stored(
-        __name__,
-        "add_effect_forces",
-        "the forces of effects",
-        pointers=2,  # MuJoCo's model and data
-        constants=constants,
-    )
-
-
-def find_callback(mujoco_batch: MujocoBatch, step_forces: StepForces) -> Any:
-    """Return the compiled callback that computes effect forces within MuJoCo's steps.
-
-    The result is None if it cannot compute these forces in this batch, or is not available.
-
-    Args:
-        mujoco_batch: the batch.
-        step_forces: effects to evaluate.
-    """
-    import mujoco
-
-    disable = mujoco.mjtDisableBit
-    required_parts = int(disable.mjDSBL_ACTUATION) | int(disable.mjDSBL_FRICTIONLOSS)
-    # The callback is impossible with effects that are not compiled, with switched servos, and with
-    # loads of transmissions, which require evaluations within a step. MuJoCo must compute
-    # actuators, in which it calls the callback, and dry friction. A callback that the user has set
-    # is not replaced.
-    if (
-        not step_forces.prepared.program.is_traced
-        or step_forces.depends_on_switches
-        or step_forces.loaded.any()
-        or mujoco_batch.model.opt.disableflags & required_parts
-        or mujoco.get_mjcb_control() is not None
-    ):
-        return None
-    return _get_callback()
-
-
 class CallbackContexts:
     """Contexts of the callback for all batch elements, and the arrays that they refer to."""
 
@@ -439,11 +394,59 @@ class CallbackContexts:
             )
 
 
+def find_callback(mujoco_batch: MujocoBatch, step_forces: StepForces) -> Any:
+    """Return the compiled callback that computes effect forces within MuJoCo's steps.
+
+    The result is None if it cannot compute these forces in this batch, or is not available.
+
+    Args:
+        mujoco_batch: the batch.
+        step_forces: effects to evaluate.
+    """
+    import mujoco
+
+    disable = mujoco.mjtDisableBit
+    required_parts = int(disable.mjDSBL_ACTUATION) | int(disable.mjDSBL_FRICTIONLOSS)
+    # The callback is impossible with effects that are not compiled, with switched servos, and with
+    # loads of transmissions, which require evaluations within a step. MuJoCo must compute
+    # actuators, in which it calls the callback, and dry friction. A callback that the user has set
+    # is not replaced.
+    if (
+        not step_forces.prepared.program.is_traced
+        or step_forces.depends_on_switches
+        or step_forces.loaded.any()
+        or mujoco_batch.model.opt.disableflags & required_parts
+        or mujoco.get_mjcb_control() is not None
+    ):
+        return None
+    return _get_callback()
+
+
 @cache
 def _get_callback() -> Any:
     """Return the compiled callback; None if it is not available."""
     offsets = find_data_offsets()
     return None if offsets is None else load_callback(offsets)
+
+
+def load_callback(offsets: Mapping[str, int]) -> Callable[..., None]:
+    """Return the compiled callback of MuJoCo's steps, compiled on first use.
+
+    Args:
+        offsets: offset of each field in MuJoCo's data, in words of eight bytes.
+
+    Raises:
+        InputError: the compiler or its machine code cannot be used.
+    """
+    # The compiler replaces the module's constants, such as QPOS, by these offsets.
+    constants = {name.upper(): offset for name, offset in offsets.items()}
+    return load_stored(
+        __name__,
+        "add_effect_forces",
+        "the forces of effects",
+        pointers=2,  # MuJoCo's model and data
+        constants=constants,
+    )
 
 
 def find_data_offsets() -> dict[str, int] | None:

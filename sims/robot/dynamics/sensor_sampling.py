@@ -1,4 +1,4 @@
-"""Recorded samples of a channel, interpolated between steps, with sensor effects.
+"""Recorded samples of a channel, interpolated between steps, with sensor effects, and their times.
 
 Between two steps of length h, with values a, b and slopes a', b' at their ends, a position at the
 fraction s of the step is
@@ -22,7 +22,6 @@ from sims.robot.dynamics.run_batches import RobotRunBatch
 
 TIME_TOLERANCE_SHARE = 1e-6
 """Tolerance, as a share of a step, within which a time counts as the end of a step."""
-
 MAX_DURATION_FACTOR, MAX_EXTRA_SECONDS = 1.1, 0.2
 """Maximum simulated time after the last time stamp if sensors sample early.
 
@@ -138,6 +137,30 @@ def find_sample_steps(step: float, times: Array, count: int) -> NDArray[np.intp]
     return nearest.astype(np.intp) if is_at_step_end else None
 
 
+def list_last_read_times(work: RobotRunBatch) -> Array:
+    """Return the last time at which a sensor is read in a run, in seconds since its start.
+
+    The simulation must last until then. Without effects on sensors it is the last time stamp. If
+    an effect makes the clock of the recording slow, the true time is later.
+
+    Args:
+        work: batch elements of the run, with their active effects.
+
+    Returns:
+        An array (1,) with the time, which is at most `MAX_DURATION_FACTOR` times the last time
+        stamp plus `MAX_EXTRA_SECONDS`.
+    """
+    last_stamp = float(work.times[-1])
+    latest = last_stamp
+    for effect, c in work.acting:
+        if isinstance(effect, Sensor):
+            # True times of the last stamp in all n batch elements, (n, 1).
+            true_times = effect.times(c, np.full(c[0].shape, last_stamp))
+            latest = max(latest, float(np.max(true_times)))
+    # Implausible values that a fit tries must not cost thousands of steps.
+    return np.array([min(latest, MAX_DURATION_FACTOR * last_stamp + MAX_EXTRA_SECONDS)])
+
+
 def preserves_time(sensors: ActiveEffects) -> bool:
     """Return whether the readings depend on the value at the sample time alone."""
     sensor_effects = [e for e, _ in sensors if isinstance(e, Sensor)]
@@ -208,27 +231,3 @@ def _interpolate(values: Array, slopes: Array | None, step: float, instants: Arr
         - s * s * rest * end_change
     )
     return cubic
-
-
-def list_last_read_times(work: RobotRunBatch) -> Array:
-    """Return the last time at which a sensor is read in a run, in seconds since its start.
-
-    The simulation must last until then. Without effects on sensors it is the last time stamp. If
-    an effect makes the clock of the recording slow, the true time is later.
-
-    Args:
-        work: batch elements of the run, with their active effects.
-
-    Returns:
-        An array (1,) with the time, which is at most `MAX_DURATION_FACTOR` times the last time
-        stamp plus `MAX_EXTRA_SECONDS`.
-    """
-    last_stamp = float(work.times[-1])
-    latest = last_stamp
-    for effect, c in work.acting:
-        if isinstance(effect, Sensor):
-            # True times of the last stamp in all n batch elements, (n, 1).
-            true_times = effect.times(c, np.full(c[0].shape, last_stamp))
-            latest = max(latest, float(np.max(true_times)))
-    # Implausible values that a fit tries must not cost thousands of steps.
-    return np.array([min(latest, MAX_DURATION_FACTOR * last_stamp + MAX_EXTRA_SECONDS)])

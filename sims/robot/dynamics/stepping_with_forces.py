@@ -14,10 +14,7 @@ from sims.robot.dynamics.disabled_drives import iterate_constant_stretches
 from sims.robot.dynamics.effect_force_program import StepForces
 from sims.robot.dynamics.midpoint_state import Mask, MidpointPredictor
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
-from sims.robot.dynamics.mujoco_callback import (
-    CallbackContexts,
-    find_callback,
-)
+from sims.robot.dynamics.mujoco_callback import CallbackContexts, find_callback
 
 
 def step_with_forces(

@@ -15,7 +15,6 @@ import numpy as np
 from sims import effects as library
 from sims.core.effect import SeriesElement
 from sims.core.freed_memory import release_free_memory
-from sims.core.simulator import Array
 from sims.effects.transmission import combine_elements, make_series_element
 from sims.extended_simulator import FittedValue
 from sims.robot.contact_pairs import add_contact_pairs
@@ -30,23 +29,13 @@ from sims.robot.dynamics.series_joints import (
 )
 from sims.robot.export.input_effect_writers import COMMAND_WRITERS, get_application_order
 from sims.robot.export.mjcf_attributes import (
-    ANGLE_ATTRIBUTES,
-    ATTRIBUTES_BY_KIND,
-    ENUM_ATTRIBUTES,
-    FLAG_ATTRIBUTES,
-    INTEGER_ATTRIBUTES,
-    MAX_CORRECTION_ROUNDS,
-    ROUNDING_TOLERANCE,
-    AttributeStatement,
     Fields,
-    Kind,
     ModelElement,
     UnstatableCauseError,
     copy_model_fields,
     find_differing_statements,
-    find_missing_statements,
 )
-from sims.robot.export.mjcf_writer import format_spec
+from sims.robot.export.spec_editing import compile_changed_spec, format_spec
 from sims.robot.fitted_causes import FittedCause, expand_families, is_gravity_compensated
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.robot_model import RobotModel
@@ -180,12 +169,12 @@ def apply_causes(
                 element = ModelElement("actuator", actuator.id)
                 comments.setdefault(element, []).append(cause.format(recording))
     # 3. Editable model.
-    spec, model = _compile_changed_spec(robot, target_values)
+    spec, model = compile_changed_spec(robot, target_values)
     if any(is_compliant_flank(transmission)[0] for transmission in series.values()):
         # The solver parameters of compliant flanks (a gap with a spring) depend on the compiled
         # inertia, and so on all causes.
         robot = prepare_flanks_for_file(robot, series, model)
-        spec, model = _compile_changed_spec(robot, target_values)
+        spec, model = compile_changed_spec(robot, target_values)
     # Only the text is stored, since a compiled spec holds all meshes a second time.
     text = format_spec(spec, robot.path.resolve().parent)
     del spec
@@ -284,180 +273,3 @@ def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
     """
     elements = robot.spec.joints if cause.effect.startswith("joint.") else robot.spec.bodies
     return any(element.name == cause.place and element.frame is not None for element in elements)
-
-
-def _compile_changed_spec(robot: RobotModel, target_values: Fields) -> tuple[Any, Any]:
-    """Change a copy of the robot's editable model until it compiles to the wanted fields.
-
-    The compiler derives fields (numbers of the compiled model) from attributes of the file, so a
-    change may also modify values that should stay. So in each of at most `MAX_CORRECTION_ROUNDS`
-    rounds:
-
-    1. Find the attributes whose fields differ from the wanted ones; without any, return the model.
-    2. Set them, and compile the model.
-
-    Args:
-        robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
-        target_values: wanted fields of the compiled model.
-
-    Returns:
-        The changed mujoco.MjSpec, and the compiled model.
-
-    Raises:
-        RuntimeError: fields still differ after the last round; this is a program error.
-    """
-    spec, model = robot.spec.copy(), robot.compiled
-    elements = _index_spec_elements(spec)
-    tolerance = 0.0  # Later rounds ignore rounding by the compiler.
-    for _ in range(MAX_CORRECTION_ROUNDS):
-        # 1. Differences.
-        statements = find_missing_statements(model, target_values, tolerance)
-        if not statements:
-            return spec, model
-        # 2. Changes. The kind "body" means the mass and inertia of a body.
-        for statement in statements:
-            set_attributes(elements[statement.element], statement)
-        if any(statement.element.kind == "body" for statement in statements):
-            _keep_masses(spec, target_values)
-        model, tolerance = spec.compile(), ROUNDING_TOLERANCE
-    missing_statements = find_missing_statements(model, target_values, tolerance)
-    if missing_statements:
-        raise RuntimeError(f"{robot.path}: the model does not take {missing_statements[0]}")
-    return spec, model
-
-
-def _keep_masses(spec: Any, target_values: Fields) -> None:
-    """Change compiler settings so that MuJoCo uses the masses and inertias of bodies as specified.
-
-    By default settings of a file, it may compute them from shapes, or scale them to a total mass.
-
-    Args:
-        spec: the model as an `MjSpec`, changed in place.
-        target_values: target fields of the compiled model.
-    """
-    import mujoco
-
-    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-    if spec.compiler.settotalmass > 0:
-        spec.compiler.settotalmass = float(target_values["body_mass"].sum())
-
-
-def _index_spec_elements(spec: Any) -> dict[ModelElement, Any]:
-    """Return the elements of an editable model (`mujoco.MjSpec`) by kind and compiled number.
-
-    A body is there twice: as ``body`` for its inertial, and as ``frame`` for its pose. The options
-    of the model are the element ``option`` with the number 0.
-
-    Args:
-        spec: editable model; it is compiled here.
-
-    Returns:
-        Elements of the spec, whose attributes can be set, by kind and number.
-    """
-    # Elements have numbers only after compilation.
-    spec.compile()
-    elements_by_kind: dict[Kind, Any] = {
-        "joint": spec.joints,
-        "body": spec.bodies,
-        "frame": spec.bodies,
-        "actuator": spec.actuators,
-        "geom": spec.geoms,
-        "pair": spec.pairs,
-    }
-    elements = {
-        ModelElement(kind, element.id): element
-        for kind, of_kind in elements_by_kind.items()
-        for element in of_kind
-    }
-    return elements | {ModelElement("option", 0): spec.option}
-
-
-def set_attributes(element: Any, statement: AttributeStatement) -> None:
-    """Set attributes of an element of an editable MuJoCo model.
-
-    Values from the compiled model are converted to the form that the editable model expects:
-    enumerations, flags, integers, degrees. Other attributes that would take precedence over the new
-    values are reset.
-
-    Args:
-        element: element of a `mujoco.MjSpec`; it is changed in place.
-        statement: attributes with their values in the units of the compiled model.
-    """
-    import mujoco
-
-    # 1. Values.
-    kind = statement.element.kind
-    spec_names = {attribute.name: attribute.spec for attribute in ATTRIBUTES_BY_KIND[kind]}
-    for name, values in statement.values.items():
-        if name in ENUM_ATTRIBUTES:
-            value: Any = getattr(mujoco, ENUM_ATTRIBUTES[name])(int(values[0]))
-        elif name in FLAG_ATTRIBUTES:
-            limit_states = mujoco.mjtLimited
-            value = limit_states.mjLIMITED_TRUE if values[0] else limit_states.mjLIMITED_FALSE
-        elif name in INTEGER_ATTRIBUTES:
-            value = int(values[0])
-        elif kind == "frame" and name == "pos":
-            value = _convert_to_inner_frame(element, values)
-        else:
-            value = _convert_to_attribute(element, name, spec_names[name], values)
-        setattr(element, spec_names[name], value)
-    # 2. Attributes that would take precedence: a full tensor, or another form of the orientation of
-    # an inertial, and `springdamper` of a joint.
-    if kind == "body":
-        element.explicitinertial = True
-        element.fullinertia = np.full(6, np.nan)
-        element.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    if kind == "joint" and {"damping", "stiffness"} & set(statement.values):
-        element.springdamper = (0.0, 0.0)
-
-
-def _convert_to_inner_frame(body: Any, position: Sequence[float]) -> Array:
-    """Convert the position of a body from its parent body's frame to the innermost frame around it.
-
-    MuJoCo replaces bodies that it fuses into their parents by elements ``<frame>``, which may be
-    nested. The position of a body in the editable model is relative to the innermost of them, but
-    in the compiled model to the parent. First the pose of the innermost frame in the parent is
-    composed, from the inside to the outside.
-
-    Args:
-        body: body of the editable model; without frames the position stays as it is.
-        position: x, y, z in m.
-    """
-    # Importing scipy.spatial takes 0.1 s, and most model files have no fused bodies.
-    from scipy.spatial.transform import Rotation
-
-    # Pose of the innermost frame in the frame reached so far, at last in the parent body.
-    rotation, origin = Rotation.identity(), np.zeros(3)
-    frame = body.frame
-    while frame is not None:
-        w, *xyz = frame.quat  # SciPy expects the real part last
-        outer = Rotation.from_quat([*xyz, w])
-        rotation, origin = outer * rotation, frame.pos + outer.apply(origin)
-        frame = frame.frame
-    result: Array = rotation.inv().apply(np.asarray(position) - origin)
-    return result
-
-
-def _convert_to_attribute(element: Any, name: str, attribute: str, values: Sequence[float]) -> Any:
-    """Convert values to the form of a spec attribute: a number, or an array padded with zeros.
-
-    Angles of a hinge are converted to degrees if the spec's compiler uses degrees.
-
-    Args:
-        element: element of the spec.
-        name: name of the attribute in an MJCF.
-        attribute: its name in the spec.
-        values: its numbers, angles in rad.
-    """
-    import mujoco
-
-    if name in ANGLE_ATTRIBUTES and element.type == mujoco.mjtJoint.mjJNT_HINGE:
-        return float(np.rad2deg(values[0])) if element.compiler.degree else values[0]
-    shape = np.shape(getattr(element, attribute))
-    if not shape:
-        return values[0]
-    # A spec may have more or fewer numbers than the compiled model.
-    padded = np.zeros(shape)
-    padded[: len(values)] = values[: len(padded)]
-    return padded

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from sims.robot.export.apply_causes import (
-    ModifiedModel,
-)
+from sims.robot.export.apply_causes import ModifiedModel
 from sims.robot.export.mjcf_attributes import (
     ATTRIBUTES_BY_KIND,
     ModelElement,
@@ -14,10 +12,7 @@ from sims.robot.export.mjcf_attributes import (
     list_all_attributes,
 )
 from sims.robot.export.mjcf_document import FILE_ELEMENTS, MjcfDocument, compile_mjcf
-from sims.robot.export.mjcf_writer import (
-    SHORTCUT_ATTRIBUTES,
-    format_attributes,
-)
+from sims.robot.export.mjcf_writer import SHORTCUT_ATTRIBUTES, format_attributes
 from sims.robot.export.model_comparison import EQUAL_NUMBERS_TOLERANCE, find_first_difference
 from sims.robot.export.xml_editing import (
     NotEditableError,

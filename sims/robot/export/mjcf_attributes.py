@@ -26,14 +26,6 @@ Fields = dict[str, Any]
 
 Values = tuple[float, ...]
 
-MAX_CORRECTION_ROUNDS = 4
-"""Maximum number of rounds that restore values which another change has modified."""
-
-ROUNDING_TOLERANCE = 1e-13
-"""Relative difference between compiled numbers that counts as rounding."""
-
-KEPT_VALUE_NOTE = "unchanged: without this line another change would alter it"
-
 
 class ModelElement(NamedTuple):
     """An element of a model file.

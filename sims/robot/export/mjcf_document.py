@@ -1,6 +1,6 @@
 """MJCF source document with its included files.
 
-It relates the elements of the source text to their numbers in the compiled model.
+It relates the elements of the source text to their numbers in the compiled model, and compiles it.
 """
 
 from __future__ import annotations

@@ -1,16 +1,19 @@
-"""Write attributes, comments and added elements into an MJCF, or a whole spec as MJCF."""
+"""Write attributes, comments and added elements into the text of an MJCF.
+
+`MjcfEditor` finds the attributes that are needed, and `MjcfWriter` writes them. The elements that
+causes add are written first (`render_with_added_elements`).
+"""
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sims.robot.coupled_drives import find_preceding_joint, get_coupling_address
+from sims.robot.export.apply_causes import ModifiedModel
 from sims.robot.export.mjcf_attributes import (
     ANGLE_ATTRIBUTES,
     ENUM_ATTRIBUTES,
@@ -21,10 +24,13 @@ from sims.robot.export.mjcf_attributes import (
     ModelElement,
     Values,
     copy_model_fields,
+    find_missing_statements,
     get_enum_word,
     list_all_attributes,
 )
-from sims.robot.export.mjcf_document import MjcfDocument
+from sims.robot.export.mjcf_document import MjcfDocument, compile_mjcf
+from sims.robot.export.model_comparison import EQUAL_NUMBERS_TOLERANCE, find_first_difference
+from sims.robot.export.spec_editing import MAX_CORRECTION_ROUNDS, ROUNDING_TOLERANCE
 from sims.robot.export.xml_editing import (
     NotEditableError,
     XmlElement,
@@ -37,6 +43,8 @@ from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
 SHORTCUT_ATTRIBUTES = ("kp", "kv", "ki", "dampratio", "timeconst", "inheritrange")
 """Attributes of MuJoCo's actuator shortcuts that ``general`` does not have."""
 
+KEPT_VALUE_NOTE = "unchanged: without this line another change would alter it"
+"""Comment at an element that is written although no cause changes it."""
 
 _LIST_ATTRIBUTES = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
 
@@ -49,216 +57,86 @@ _INPUT_BY_SHORTCUT = {"position": "pos", "velocity": "vel"}
 _GAIN_ATTRIBUTES = {"gainprm", "biasprm"}
 
 
-def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
-    """Format values as text of attributes."""
-    return {name: _format_values(name, value) for name, value in values.items()}
+class MjcfEditor:
+    """Editor of an MJCF text: it writes attributes until the text compiles to the wanted model."""
 
+    def __init__(
+        self, robot: RobotModel, applied: ModifiedModel, recording: str, text: bytes
+    ) -> None:
+        """Compile the document before its attributes change, as a reference for what must change.
 
-def _format_values(name: str, values: tuple[float, ...]) -> str:
-    """Format the numbers of an attribute for MJCF, as its kind demands.
+        Args:
+            robot: robot with the text.
+            applied: model that the text should compile to.
+            recording: title of the recording.
+            text: text of the model file.
+        """
+        self.robot, self.applied, self.recording, self.text = robot, applied, recording, text
+        self.folder = robot.path.resolve().parent
+        self.original = compile_mjcf(self._parse_document().to_text())
 
-    An enumeration becomes a word, a flag ``true`` or ``false``, a count an integer; all others are
-    a number or a list of numbers.
+    def _parse_document(self) -> MjcfDocument:
+        """Parse the text, with asset folders that are valid from anywhere."""
+        document = MjcfDocument(self.text, self.robot.path)
+        document.make_paths_absolute(self.folder)
+        return document
 
-    Args:
-        name: name of the attribute.
-        values: its numbers, as in the compiled model.
-    """
-    # ``interp``, a kind of interpolation, is a word in a file but a plain integer in a spec.
-    if name in ENUM_ATTRIBUTES or name == "interp":
-        return get_enum_word(name, values[0])
-    if name in FLAG_ATTRIBUTES:
-        return "true" if values[0] else "false"
-    if name in INTEGER_ATTRIBUTES:
-        return str(int(values[0]))
-    if name in _LIST_ATTRIBUTES:
-        # Trailing zeros are omitted, since numbers missing in a list are zero.
-        last_nonzero = max((i for i, value in enumerate(values) if value), default=0)
-        return format_numbers(values[: last_nonzero + 1])
-    return format_numbers(values)
+    def to_text(self) -> str:
+        """Return the text with all wanted attributes, checked by compiling it.
 
+        MuJoCo derives its numbers from attributes in many ways, so a change may have no effect, or
+        change other numbers too. So in each of at most `MAX_CORRECTION_ROUNDS` rounds:
 
-EXACT_DIGITS = 17
-"""Number of significant digits with which every float64 number is read back exactly."""
+        1. Find the attributes whose numbers in the compiled text differ from the wanted ones, and
+           add them to those that are to be written.
+        2. Write all of them into the original text, and compile it.
 
-
-def format_spec(spec: Any, folder: Path) -> str:
-    """Format an editable MuJoCo model as MJCF with full precision and absolute asset folders.
-
-    MuJoCo writes six digits by default, which would change the motion. Angles and other values keep
-    the notation of the model file.
-
-    Args:
-        spec: compiled `mujoco.MjSpec`; it must not be used afterwards.
-        folder: folder to which the paths of its assets are relative.
-
-    Returns:
-        The MJCF text.
-
-    Raises:
-        RuntimeError: this MuJoCo library has no function that sets the number of digits.
-    """
-    spec.meshdir = str(folder / spec.meshdir)
-    spec.texturedir = str(folder / spec.texturedir)
-    spec.compiler.savecompiled = False
-    spec.compiler.savecanonical = False
-    # The number of digits is a setting of MuJoCo's library, which is restored afterwards.
-    library = _load_library()
-    try:
-        digits = library._mjPRIVATE__get_xml_precision()
-        library._mjPRIVATE__set_xml_precision(EXACT_DIGITS)
-    except AttributeError:
-        raise RuntimeError("this MuJoCo writes models with six digits only") from None
-    try:
-        return str(spec.to_xml())
-    finally:
-        library._mjPRIVATE__set_xml_precision(digits)
-
-
-@cache
-def _load_library() -> Any:
-    """Load MuJoCo's shared library; its Python module does not expose the number of digits."""
-    import mujoco
-
-    folder = Path(mujoco.__file__).parent
-    patterns = ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll")  # Linux, macOS, Windows
-    path, *_ = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
-    return ctypes.CDLL(str(path))
-
-
-def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
-    """Return the text of the model file with the elements that causes add, and a fixed base.
-
-    1. For a base that a recording fixes, remove free joints and keyframes.
-    2. Add tendons of coupled drives.
-    3. Add pairs of geoms with contact parameters of their own.
-    4. Add joints in series (second joints of flexible or slack drives).
-
-    Other numbers are written afterwards. Without any of these elements, the text is unchanged.
-
-    Args:
-        robot: robot with the added elements.
-        model: compiled model with the causes.
-
-    Raises:
-        NotEditableError: the text does not contain a required joint, actuator or geom.
-    """
-    text = robot.path.read_bytes()
-    has_fixed_base = robot.engine_table.get("fix_base", False)
-    if not robot.series and not robot.coupled and not has_fixed_base and not robot.spec.pairs:
+        Raises:
+            NotEditableError: the edited text does not compile to the wanted model.
+        """
+        # An element with comments needs a statement even if its numbers are in the text already.
+        statements = {element: AttributeStatement(element) for element in self.applied.comments}
+        model = self.original
+        for _ in range(MAX_CORRECTION_ROUNDS):
+            # 1. Differences.
+            for statement in find_missing_statements(
+                model, self.applied.target_values, ROUNDING_TOLERANCE
+            ):
+                element_statement = statements.setdefault(
+                    statement.element, AttributeStatement(statement.element)
+                )
+                # Attributes that were written without effect, or that another change has altered
+                # (in a round after the first), need their related attributes.
+                had_no_effect = bool(element_statement.values)
+                is_later_round = model is not self.original
+                element_statement.insisted = had_no_effect or is_later_round
+                element_statement.values |= statement.values
+            # 2. New text.
+            text = self._render_document(list(statements.values()))
+            model = compile_mjcf(text)
+            if not find_missing_statements(model, self.applied.target_values, ROUNDING_TOLERANCE):
+                break
+        difference = find_first_difference(model, self.applied.model, EQUAL_NUMBERS_TOLERANCE)
+        if difference:
+            raise NotEditableError(f"its attributes do not state everything ({difference})")
         return text
-    document = MjcfDocument(text, robot.path)
-    # 1. As by `parsing.floating_bases.fix_bases`. An element with an empty text is left out.
-    if has_fixed_base:
-        for tag in document.walk():
-            is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
-            if tag.name in ("freejoint", "keyframe") or is_free:
-                tag.text = b""
-    # 2. Tendons.
-    if robot.coupled:
-        _write_couplings(document, robot, model)
-    # 3. Pairs.
-    _add_pairs(document, robot)
-    # 4. Joints in series, each after the joint of its drive.
-    tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
-    for series_joint in (joint for joint in robot.spec.joints if joint.name in robot.series):
-        # Its name is that of the drive's joint and an ending.
-        drive_joint, _, _ = series_joint.name.rpartition("_")
-        joint_tag = tags.get(drive_joint)
-        if joint_tag is None:
-            raise NotEditableError(f"no joint of its text is in series with {series_joint.name}")
-        joint_tag.after.append(_render_series_joint(series_joint))
-    return document.to_text().encode()
 
+    def _render_document(self, statements: Sequence[AttributeStatement]) -> str:
+        """Return the text of the document with the statements, their comments and a heading.
 
-def _write_couplings(document: MjcfDocument, robot: RobotModel, model: Any) -> None:
-    """Write the couplings of drives: a fixed tendon for each, which the joint's actuators drive.
+        The comments of an element name the causes that change it. An element without a cause has a
+        statement because another change would alter it, and its comment says so.
 
-    The length of the tendon is q + c q_first, with the position q of the drive's joint, that of the
-    preceding joint q_first, and the coefficient c.
-
-    Args:
-        document: the MJCF, changed in place.
-        robot: robot with the couplings.
-        model: compiled model with the causes, which has the coefficients of the couplings.
-
-    Raises:
-        NotEditableError: the text lacks a joint or an actuator of the compiled model.
-    """
-    # Elements of the actuators, in the order of their numbers.
-    tags = [child for tag in document.find_elements("actuator") for child in document.children(tag)]
-    if len(tags) != len(robot.actuators):
-        raise NotEditableError("the compiled model has other actuators")
-    joint_names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
-    for name in robot.coupled:
-        first = find_preceding_joint(robot, name)
-        assert first is not None  # only joints with a preceding one can be coupled
-        if not {name, first.name} <= joint_names:
-            raise NotEditableError(f"no joint of its text is called {name} or {first.name}")
-        c = format_number(float(model.wrap_prm[get_coupling_address(robot, name)]))
-        joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
-        tendon = f'<fixed name="{name}{COUPLING_TENDON_SUFFIX}">{joints}</fixed>'
-        document.root.insert_within(f"<tendon>{tendon}</tendon>")
-        # The actuators of the joint get the tendon as their target.
-        for actuator in (a for a in robot.actuators if a.joint == name):
-            tags[actuator.id].removed |= {"joint", "jointinparent"}
-            tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"
-
-
-def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
-    """Write the elements `<pair>` of a robot that the text lacks.
-
-    A pair states the parameters of one contact; it refers to its geoms by their names.
-
-    Args:
-        document: the MJCF, changed in place.
-        robot: the robot with its pairs.
-
-    Raises:
-        NotEditableError: a geom has no name in the text.
-    """
-    existing_pairs = document.find_pairs()
-    names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "geom"}
-    for pair in robot.spec.pairs:
-        geoms = frozenset((pair.geomname1, pair.geomname2))
-        if geoms in existing_pairs:
-            continue
-        if not geoms <= names:
-            raise NotEditableError(f"a geom of the contact {pair.name} has no name in its text")
-        attributes = {"name": pair.name, "geom1": pair.geomname1, "geom2": pair.geomname2}
-        attributes["condim"] = str(pair.condim)
-        for name in ("friction", "solref", "solimp"):
-            attributes[name] = format_numbers(tuple(getattr(pair, name)))
-        attributes |= {name: format_number(getattr(pair, name)) for name in ("margin", "gap")}
-        pair_text = format_element("pair", attributes)
-        document.root.insert_within(f"<contact>{pair_text}</contact>")
-
-
-def _render_series_joint(second: Any) -> str:
-    """Render a joint that is added in series with another one as an MJCF element.
-
-    All attributes are stated, so that the file's default classes have no influence on it. A limited
-    range represents backlash.
-
-    Args:
-        second: joint of the `mujoco.MjSpec`.
-    """
-    kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
-    is_limited = str(second.limited).endswith("TRUE")
-    attributes = {
-        "name": second.name,
-        "type": kind,
-        "axis": format_numbers(tuple(second.axis)),
-        "pos": format_numbers(tuple(second.pos)),
-        "limited": "true" if is_limited else "false",
-        "actuatorfrclimited": "false",
-    }
-    if is_limited:
-        attributes["range"] = format_numbers(tuple(second.range))
-        attributes["solreflimit"] = format_numbers(tuple(second.solref_limit))
-        attributes["solimplimit"] = format_numbers(tuple(second.solimp_limit))
-    attributes |= dict.fromkeys(("damping", "frictionloss", "armature", "stiffness"), "0")
-    return format_element("joint", attributes)
+        Args:
+            statements: attribute values to write, by element.
+        """
+        document = self._parse_document()
+        writer = MjcfWriter(document, self.original, self.applied.target_values)
+        for statement in statements:
+            writer.write(statement, self.applied.comments.get(statement.element, [KEPT_VALUE_NOTE]))
+        heading = format_heading(self.robot.path, self.recording, self.applied.notes)
+        document.root.within.insert(0, ([heading], ""))
+        return document.to_text()
 
 
 def format_heading(path: Path, recording: str, notes: Iterable[str]) -> str:
@@ -274,7 +152,7 @@ def format_heading(path: Path, recording: str, notes: Iterable[str]) -> str:
 
 
 class MjcfWriter:
-    """Writer of attribute statements into a document.
+    """Writer of given attribute statements into a parsed document, once, without compiling it.
 
     Attributes:
         degrees: whether the document specifies angles in degrees.
@@ -519,5 +397,169 @@ def _format_shortcut(
     return None
 
 
+def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
+    """Format values as text of attributes."""
+    return {name: _format_values(name, value) for name, value in values.items()}
+
+
+def _format_values(name: str, values: tuple[float, ...]) -> str:
+    """Format the numbers of an attribute for MJCF, as its kind demands.
+
+    An enumeration becomes a word, a flag ``true`` or ``false``, a count an integer; all others are
+    a number or a list of numbers.
+
+    Args:
+        name: name of the attribute.
+        values: its numbers, as in the compiled model.
+    """
+    # ``interp``, a kind of interpolation, is a word in a file but a plain integer in a spec.
+    if name in ENUM_ATTRIBUTES or name == "interp":
+        return get_enum_word(name, values[0])
+    if name in FLAG_ATTRIBUTES:
+        return "true" if values[0] else "false"
+    if name in INTEGER_ATTRIBUTES:
+        return str(int(values[0]))
+    if name in _LIST_ATTRIBUTES:
+        # Trailing zeros are omitted, since numbers missing in a list are zero.
+        last_nonzero = max((i for i, value in enumerate(values) if value), default=0)
+        return format_numbers(values[: last_nonzero + 1])
+    return format_numbers(values)
+
+
 def _add_comments(tag: XmlElement, comments: Sequence[str]) -> None:
     tag.before += [text for text in comments if text not in tag.before]
+
+
+def render_with_added_elements(robot: RobotModel, model: Any) -> bytes:
+    """Return the text of the model file with the elements that causes add, and a fixed base.
+
+    1. For a base that a recording fixes, remove free joints and keyframes.
+    2. Add tendons of coupled drives.
+    3. Add pairs of geoms with contact parameters of their own.
+    4. Add joints in series (second joints of flexible or slack drives).
+
+    Other numbers are written afterwards. Without any of these elements, the text is unchanged.
+
+    Args:
+        robot: robot with the added elements.
+        model: compiled model with the causes.
+
+    Raises:
+        NotEditableError: the text does not contain a required joint, actuator or geom.
+    """
+    text = robot.path.read_bytes()
+    has_fixed_base = robot.engine_table.get("fix_base", False)
+    if not robot.series and not robot.coupled and not has_fixed_base and not robot.spec.pairs:
+        return text
+    document = MjcfDocument(text, robot.path)
+    # 1. As by `parsing.floating_bases.fix_bases`. An element with an empty text is left out.
+    if has_fixed_base:
+        for tag in document.walk():
+            is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
+            if tag.name in ("freejoint", "keyframe") or is_free:
+                tag.text = b""
+    # 2. Tendons.
+    if robot.coupled:
+        _write_couplings(document, robot, model)
+    # 3. Pairs.
+    _add_pairs(document, robot)
+    # 4. Joints in series, each after the joint of its drive.
+    tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
+    for series_joint in (joint for joint in robot.spec.joints if joint.name in robot.series):
+        # Its name is that of the drive's joint and an ending.
+        drive_joint, _, _ = series_joint.name.rpartition("_")
+        joint_tag = tags.get(drive_joint)
+        if joint_tag is None:
+            raise NotEditableError(f"no joint of its text is in series with {series_joint.name}")
+        joint_tag.after.append(_render_series_joint(series_joint))
+    return document.to_text().encode()
+
+
+def _write_couplings(document: MjcfDocument, robot: RobotModel, model: Any) -> None:
+    """Write the couplings of drives: a fixed tendon for each, which the joint's actuators drive.
+
+    The length of the tendon is q + c q_first, with the position q of the drive's joint, that of the
+    preceding joint q_first, and the coefficient c.
+
+    Args:
+        document: the MJCF, changed in place.
+        robot: robot with the couplings.
+        model: compiled model with the causes, which has the coefficients of the couplings.
+
+    Raises:
+        NotEditableError: the text lacks a joint or an actuator of the compiled model.
+    """
+    # Elements of the actuators, in the order of their numbers.
+    tags = [child for tag in document.find_elements("actuator") for child in document.children(tag)]
+    if len(tags) != len(robot.actuators):
+        raise NotEditableError("the compiled model has other actuators")
+    joint_names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
+    for name in robot.coupled:
+        first = find_preceding_joint(robot, name)
+        assert first is not None  # only joints with a preceding one can be coupled
+        if not {name, first.name} <= joint_names:
+            raise NotEditableError(f"no joint of its text is called {name} or {first.name}")
+        c = format_number(float(model.wrap_prm[get_coupling_address(robot, name)]))
+        joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
+        tendon = f'<fixed name="{name}{COUPLING_TENDON_SUFFIX}">{joints}</fixed>'
+        document.root.insert_within(f"<tendon>{tendon}</tendon>")
+        # The actuators of the joint get the tendon as their target.
+        for actuator in (a for a in robot.actuators if a.joint == name):
+            tags[actuator.id].removed |= {"joint", "jointinparent"}
+            tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"
+
+
+def _add_pairs(document: MjcfDocument, robot: RobotModel) -> None:
+    """Write the elements `<pair>` of a robot that the text lacks.
+
+    A pair states the parameters of one contact; it refers to its geoms by their names.
+
+    Args:
+        document: the MJCF, changed in place.
+        robot: the robot with its pairs.
+
+    Raises:
+        NotEditableError: a geom has no name in the text.
+    """
+    existing_pairs = document.find_pairs()
+    names = {tag.attributes.get("name") for tag in document.walk() if tag.name == "geom"}
+    for pair in robot.spec.pairs:
+        geoms = frozenset((pair.geomname1, pair.geomname2))
+        if geoms in existing_pairs:
+            continue
+        if not geoms <= names:
+            raise NotEditableError(f"a geom of the contact {pair.name} has no name in its text")
+        attributes = {"name": pair.name, "geom1": pair.geomname1, "geom2": pair.geomname2}
+        attributes["condim"] = str(pair.condim)
+        for name in ("friction", "solref", "solimp"):
+            attributes[name] = format_numbers(tuple(getattr(pair, name)))
+        attributes |= {name: format_number(getattr(pair, name)) for name in ("margin", "gap")}
+        pair_text = format_element("pair", attributes)
+        document.root.insert_within(f"<contact>{pair_text}</contact>")
+
+
+def _render_series_joint(second: Any) -> str:
+    """Render a joint that is added in series with another one as an MJCF element.
+
+    All attributes are stated, so that the file's default classes have no influence on it. A limited
+    range represents backlash.
+
+    Args:
+        second: joint of the `mujoco.MjSpec`.
+    """
+    kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
+    is_limited = str(second.limited).endswith("TRUE")
+    attributes = {
+        "name": second.name,
+        "type": kind,
+        "axis": format_numbers(tuple(second.axis)),
+        "pos": format_numbers(tuple(second.pos)),
+        "limited": "true" if is_limited else "false",
+        "actuatorfrclimited": "false",
+    }
+    if is_limited:
+        attributes["range"] = format_numbers(tuple(second.range))
+        attributes["solreflimit"] = format_numbers(tuple(second.solref_limit))
+        attributes["solimplimit"] = format_numbers(tuple(second.solimp_limit))
+    attributes |= dict.fromkeys(("damping", "frictionloss", "armature", "stiffness"), "0")
+    return format_element("joint", attributes)

@@ -40,11 +40,44 @@ from sims.robot.robot_model import RobotModel
 _TENSOR_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _NO_INERTIAL = "a link of the body states no inertial"
 """Reason why a change of mass or inertia cannot be written."""
-
 _SOFT_FRICTION_URDF_NOTE = (
     "friction.coulomb: a URDF cannot state that dry friction is stiff, and MuJoCo reads it in its "
     "soft form; extended.xml has the stiff form"
 )
+
+
+def render_urdf(
+    robot: RobotModel, causes: CauseCoefficients, recording: str, notes: list[str]
+) -> str | None:
+    """Render the URDF with the causes that it can express, and add notes about all others.
+
+    The result is None if its text cannot be edited.
+
+    Args:
+        robot: the robot as read from its URDF.
+        causes: coefficients of all causes.
+        recording: title of the recording, for comments.
+        notes: notes for the user, extended in place.
+    """
+    try:
+        writer = UrdfWriter(robot, recording)
+    except NotEditableError as unfit:
+        notes.append(f"no URDF is written: {unfit}")
+        return None
+    urdf_notes = []
+    fitted_causes = expand_families(robot, causes)
+    # Some causes, such as a payload, must follow others.
+    for cause in sorted(fitted_causes, key=lambda entry: get_write_order(entry.effect)):
+        try:
+            writer.write(cause)
+        except UnstatableCauseError as reason:
+            urdf_notes.append(f"{cause.format(recording)}: not in the URDF: {reason}")
+            continue
+        if cause.effect == COULOMB and robot.friction_form == "stiff":
+            urdf_notes.append(_SOFT_FRICTION_URDF_NOTE)
+    urdf_notes = list(dict.fromkeys(urdf_notes))  # without repetitions
+    notes += urdf_notes
+    return writer.to_text(urdf_notes)
 
 
 class UrdfWriter:
@@ -416,39 +449,3 @@ def _compute_rotation(rpy: Array) -> Array:
     """Return the axes (3, 3) rotated about fixed x, y and z in turn, as URDF defines ``rpy``."""
     axes: Array = Rotation.from_euler("xyz", rpy).as_matrix()
     return axes
-
-
-def render_urdf(
-    robot: RobotModel, causes: CauseCoefficients, recording: str, notes: list[str]
-) -> str | None:
-    """Render the URDF with the causes that it can express, and add notes about all others.
-
-    The result is None if its text cannot be edited.
-
-    Args:
-        robot: the robot as read from its URDF.
-        causes: coefficients of all causes.
-        recording: title of the recording, for comments.
-        notes: notes for the user, extended in place.
-    """
-    # Importing scipy.spatial takes 0.1 s, and only robots from a URDF need it.
-
-    try:
-        writer = UrdfWriter(robot, recording)
-    except NotEditableError as unfit:
-        notes.append(f"no URDF is written: {unfit}")
-        return None
-    urdf_notes = []
-    fitted_causes = expand_families(robot, causes)
-    # Some causes, such as a payload, must follow others.
-    for cause in sorted(fitted_causes, key=lambda entry: get_write_order(entry.effect)):
-        try:
-            writer.write(cause)
-        except UnstatableCauseError as reason:
-            urdf_notes.append(f"{cause.format(recording)}: not in the URDF: {reason}")
-            continue
-        if cause.effect == COULOMB and robot.friction_form == "stiff":
-            urdf_notes.append(_SOFT_FRICTION_URDF_NOTE)
-    urdf_notes = list(dict.fromkeys(urdf_notes))  # without repetitions
-    notes += urdf_notes
-    return writer.to_text(urdf_notes)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.diagnosis.pipeline.held_out_gap_closed import HeldOutGains
+from bench.diagnosis.pipeline.held_out_gap_closed import HeldOutGainCalculator
 
 CHANNELS = {"q.base.x": "m", "q.base.qw": "1", "q.wheel": "rad", "tau.wheel": "N m"}
 SIGMA = np.array([0.01, 0.01, 0.002, 0.1])
@@ -33,7 +33,7 @@ def make_gains(errors):
     simulated_runs = SimpleNamespace(
         floor=floor, fitting=runs, predicted=runs, before=None, is_cross_validated=False
     )
-    return HeldOutGains(
+    return HeldOutGainCalculator(
         SimpleNamespace(runs=simulated_runs, finding=finding, rng=np.random.default_rng(0))
     )
 

@@ -7,6 +7,7 @@ import pytest
 from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
 from bench.benchmark.isolation.tuner_processes import TunerSpec
 from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.problem.targets import draw_targets
 from bench.benchmark.runner import tuner_process_start
 from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
@@ -77,7 +78,7 @@ def experiment(name, **changes):
 def outcome(experiment, seed=0, target=0):
     """Execute one run of the experiment."""
     (entry,) = experiment.tuners
-    target_data = get_problem(experiment).draw_targets()[target].blinded
+    target_data = draw_targets(get_problem(experiment))[target].blinded
     order = RunRequest("run", entry, seed, target_data, experiment.budget)
     return execute_run(experiment, replace(order, tuned=tuner_process_start.make_tuner_spec(entry)))
 

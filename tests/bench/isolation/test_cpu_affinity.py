@@ -6,6 +6,7 @@ import pytest
 
 from bench.benchmark.isolation.message_channel import MessageChannel
 from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.problem.targets import draw_targets
 from bench.benchmark.runner import tuner_process_start
 from bench.benchmark.runner.plugin_inspection import load_plugins_for_experiment
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
@@ -46,7 +47,7 @@ def test_random_numbers_are_loaded_ahead_and_yet_others_in_each_run(
     experiment = spring_experiment(budget=2, timeout=1e9)
     load_plugins_for_experiment([str(path)], experiment)
     entry = TunerEntry("careless", "careless")
-    target = get_problem(experiment).draw_targets()[0].blinded
+    target = draw_targets(get_problem(experiment))[0].blinded
     order = RunRequest("run", entry, 0, target, 2, tuned=tuner_process_start.make_tuner_spec(entry))
     first, second = (execute_run(experiment, order).trace for _ in range(2))
     tuner_process_start.close_isolated_processes()

@@ -15,6 +15,7 @@ import pytest
 from bench.benchmark.isolation.process_errors import KilledExternallyError
 from bench.benchmark.isolation.temporary_folders import create_locked_folder, remove_stale_folders
 from bench.benchmark.problem.experiment_config import TunerEntry
+from bench.benchmark.problem.targets import draw_targets
 from bench.benchmark.runner import retry_after_kill, tuner_process_start
 from bench.benchmark.runner.plugin_inspection import inspect_plugins, load_plugins_for_experiment
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run, get_problem
@@ -107,7 +108,7 @@ def test_what_is_killed_is_made_again_with_the_same_result(slow, what):
     assert killing.killed == 1
     np.testing.assert_array_equal(disturbed["seen"], undisturbed["seen"])
     weights = train_or_load(experiment, lesson).path
-    target = get_problem(experiment).draw_targets()[0].blinded
+    target = draw_targets(get_problem(experiment))[0].blinded
     order = RunRequest(
         "run", entry, 0, target, 4, weights, tuner_process_start.make_tuner_spec(entry)
     )

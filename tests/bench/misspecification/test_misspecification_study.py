@@ -20,6 +20,7 @@ from bench.benchmark.problem.experiment_config import (
     parse_experiment,
 )
 from bench.benchmark.problem.experiment_recording import make_scenario
+from bench.benchmark.problem.targets import draw_target, draw_targets
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.study_base import prepare_study
 from bench.core.plugin_registries import simulators
@@ -71,7 +72,7 @@ def mean(folder, metric, model, tuner="least_squares"):
 def test_the_bias_of_the_plain_simulator_is_the_one_of_theory(folder):
     problem = TuningProblem(small())
     expected = []
-    for target in problem.draw_targets():
+    for target in draw_targets(problem):
         constants = target.blinded.fitting.scenarios[0].constants
         fall, angle = constants["drop_height"], constants["incline_angle"]
         speed = np.sqrt(2 * GRAVITY * fall) * np.cos(angle)
@@ -104,7 +105,7 @@ def test_the_extension_was_found_on_a_recording_that_tells_nothing_of_the_target
     drawn = {run.constants["drop_height"] for run in recording.runs}
     met = {
         target.blinded.fitting.scenarios[0].constants["drop_height"]
-        for target in TuningProblem(small()).draw_targets()
+        for target in draw_targets(TuningProblem(small()))
     }
     assert len(drawn) == 6
     assert not drawn & met
@@ -116,7 +117,7 @@ def test_the_parameters_of_the_recording_differ_from_all_targets(tmp_path):
     other = write_calibration_recording(small(), "another", tmp_path / "c.csv")
     assert made == pytest.approx(again, abs=0)
     assert made[0] != other[0]
-    truths = [target.truth[0] for target in TuningProblem(small(), "secret").draw_targets()]
+    truths = [target.truth[0] for target in draw_targets(TuningProblem(small(), "secret"))]
     assert made[0] not in truths
     # Six runs of 120 samples and two channels determine the noise to a tenth.
     seen = read_recording(tmp_path / "a.csv", simulators.get("bounce-shot")).runs
@@ -225,7 +226,7 @@ def test_worlds_have_what_the_simulators_lack(name):
     experiment = load_experiment(f"misspecified-{name}")
     assert get_study_class(experiment) is MisspecificationStudy
     problem = TuningProblem(experiment)
-    target = problem.draw_target("in", 0)
+    target = draw_target(problem, "in", 0)
     point = problem.cube.to_unit_cube(target.truth)[None]
     ours = problem.simulate(point, target.blinded.fitting.scenarios)[0]
     left = (ours - target.blinded.fitting.observed) / problem.noise

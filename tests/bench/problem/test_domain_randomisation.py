@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.benchmark.problem.experiment_config import TunerEntry, load_experiment
+from bench.benchmark.problem.targets import draw_target
 from bench.benchmark.problem.training_simulator import (
     NO_EFFECT_SHARE,
     CountedTrainingSimulator,
@@ -71,7 +72,7 @@ def test_weights_and_runs_of_the_randomised_are_others_and_of_the_plain_the_same
         != compute_training_key(SHOT, RANDOMISED, 0)
     )
     assert compute_training_key(SHOT, RANDOMISED, 0) != compute_training_key(wide, RANDOMISED, 0)
-    target = TuningProblem(SHOT).draw_target("in", 0).blinded
+    target = draw_target(TuningProblem(SHOT), "in", 0).blinded
     alike = [RunIds(e).make_run_id(PLAIN, target, 0, 5) for e in (SHOT, wide)]
     others = [RunIds(e).make_run_id(RANDOMISED, target, 0, 5) for e in (SHOT, wide)]
     assert alike[0] == alike[1]

@@ -11,6 +11,7 @@ from bench.benchmark.problem.experiment_config import (
     parse_experiment,
 )
 from bench.benchmark.problem.experiment_recording import find_recording
+from bench.benchmark.problem.targets import draw_target
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.tuner_training import compute_training_key
@@ -152,10 +153,10 @@ def test_a_sweep_is_an_experiment_for_each_combination():
 
 def test_experiments_of_a_sweep_meet_the_same_targets(spring):
     small, large = (
-        TuningProblem(e).draw_target("in", 1)
+        draw_target(TuningProblem(e), "in", 1)
         for e in expand_sweep(spring_experiment(sweep={"noise.x": [1e-9, 1e-3]}))
     )
-    alone = TuningProblem(spring_experiment()).draw_target("in", 1)
+    alone = draw_target(TuningProblem(spring_experiment()), "in", 1)
     assert small.truth.tolist() == large.truth.tolist() == alone.truth.tolist()
     assert small.blinded.start.tolist() == large.blinded.start.tolist()
     apart = large.blinded.fitting.observed - small.blinded.fitting.observed
@@ -207,7 +208,7 @@ def test_what_is_not_expanded_is_not_run(spring):
 def test_what_only_describes_enters_no_name_of_a_run_or_of_weights(spring):
     described = {"title": "Another", "says": "Words.", "tags": ["quick"]}
     plain, told = spring_experiment(), spring_experiment(**described)
-    entry, target = plain.tuners[0], TuningProblem(plain).draw_target("in", 0).blinded
+    entry, target = plain.tuners[0], draw_target(TuningProblem(plain), "in", 0).blinded
     ids = [RunIds(e).make_run_id(entry, target, 0, 12) for e in (plain, told)]
     assert ids[0] == ids[1]
     regressor = TunerEntry("regressor", "regressor")

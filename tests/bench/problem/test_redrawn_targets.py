@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.benchmark.problem.targets import count_redraws
+from bench.benchmark.problem.targets import count_redraws, draw_target, draw_targets
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from sims.core.simulator import Channel, InputError, Parameter, Simulator
 from tests.command_output import run_command
@@ -123,14 +123,14 @@ def test_what_is_not_finite_or_beyond_the_limit_counts_as_diverged(value, monkey
         "bench.benchmark.problem.tuning_problem.get_simulator_class", lambda _: Lossy
     )
     experiment = spring_experiment(ranges=["in"], targets=30, observe=[], initial={})
-    drawn = TuningProblem(experiment, "salt").draw_targets()
+    drawn = draw_targets(TuningProblem(experiment, "salt"))
     assert max(float(target.truth[0]) for target in drawn) <= 0.5
     redraws = count_redraws(experiment, drawn)
     assert redraws.redrawn == sum(target.redraws > 0 for target in drawn)
     # Half of all draws fail: 60 draws for 30 targets, with a standard deviation of 8.
     assert 36 <= redraws.draws <= 84
     # Each target has its own random streams, so it is the same when drawn alone.
-    alone = TuningProblem(experiment, "salt").draw_target("in", 7)
+    alone = draw_target(TuningProblem(experiment, "salt"), "in", 7)
     assert alone.truth.tolist() == drawn[7].truth.tolist()
 
 
@@ -142,4 +142,4 @@ def test_a_simulator_that_always_diverges_has_no_target(monkeypatch):
     )
     experiment = spring_experiment(ranges=["in"], observe=[], initial={})
     with pytest.raises(InputError, match="200 of 200 targets drawn diverges"):
-        TuningProblem(experiment).draw_target("in", 0)
+        draw_target(TuningProblem(experiment), "in", 0)

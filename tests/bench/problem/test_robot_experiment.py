@@ -13,13 +13,15 @@ from bench.benchmark.problem.experiment_config import (
     load_experiment,
     parse_experiment,
 )
-from bench.benchmark.problem.missing_requirements import find_missing_model_file
+from bench.benchmark.problem.fisher_information import compute_target_spectrum
+from bench.benchmark.problem.missing_requirements import explain_missing_model_file
 from bench.benchmark.problem.robot_experiment import (
     complete_robot_experiment,
     find_model,
     get_simulator_class,
     make_robot_experiment,
 )
+from bench.benchmark.problem.targets import draw_target
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_fingerprint import (
     RunIds,
@@ -94,7 +96,7 @@ def test_usual_commands_move_every_joint_and_keep_within_limits(arm):
 
 def ids(experiment):
     """Return the id of a run and the key of a training."""
-    target = TuningProblem(experiment).draw_target("in", 0).blinded
+    target = draw_target(TuningProblem(experiment), "in", 0).blinded
     run = RunIds(experiment).make_run_id(experiment.tuners[0], target, 0, 12)
     return run, compute_training_key(experiment, TunerEntry("regressor", "regressor"), 0)
 
@@ -233,14 +235,14 @@ def test_shipped_experiments_on_robots_are_sound_and_their_numbers_show(name, mo
     if ROBOTS.is_dir():
         monkeypatch.setenv("SIMGAP_ROBOTS", os.environ.get("SIMGAP_ROBOTS", str(ROBOTS)))
     experiment = load_experiment(name)
-    if reason := find_missing_model_file(experiment):
+    if reason := explain_missing_model_file(experiment):
         pytest.skip(reason)
     problem = TuningProblem(experiment)
     assert 4 <= problem.cube.dim <= 8
     for kind in experiment.ranges:
-        target = problem.draw_target(kind, 0)
+        target = draw_target(problem, kind, 0)
         assert np.isfinite(target.blinded.fitting.observed).all()
-    told = problem.compute_spectrum(problem.draw_target("in", 0))
+    told = compute_target_spectrum(problem, draw_target(problem, "in", 0))
     assert told.is_stiff[:4].all(), "these commands tell of most numbers"
 
 

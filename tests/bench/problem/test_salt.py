@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.benchmark.problem.targets import draw_targets
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.random_streams import (
     TargetStreams,
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("spring")
 
 def true_parameters(salt, **changes):
     return [
-        t.truth for t in TuningProblem(spring_experiment(salt="", **changes), salt).draw_targets()
+        t.truth for t in draw_targets(TuningProblem(spring_experiment(salt="", **changes), salt))
     ]
 
 
@@ -67,7 +68,7 @@ def test_a_salt_draws_each_thing_from_a_stream_of_its_own():
 
 
 def test_public_targets_are_those_of_the_published_stream():
-    (target,) = TuningProblem(spring_experiment(targets=1, ranges=["in"])).draw_targets()
+    (target,) = draw_targets(TuningProblem(spring_experiment(targets=1, ranges=["in"])))
     low, high = TuningProblem(spring_experiment()).cube.training
     rng = make_rng("spring-test", "target", "in", 0)
     np.testing.assert_array_equal(target.blinded.start, rng.uniform(low, high))
@@ -76,7 +77,7 @@ def test_public_targets_are_those_of_the_published_stream():
 def test_nobody_draws_a_secret_target_from_public_names():
     """A plugin can draw from public names (experiment, range, number), but gets another target."""
     problem = TuningProblem(spring_experiment(salt="", targets=1, ranges=["in"]), generate_salt())
-    (target,) = problem.draw_targets()
+    (target,) = draw_targets(problem)
     low, high = problem.cube.training
     rng = make_rng("spring-test", "target", "in", 0)
     drawn = problem.cube.to_physical(rng.uniform(low, high, size=(2, 2)))

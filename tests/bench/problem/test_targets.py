@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bench.benchmark.problem.experiment_config import parse_experiment
+from bench.benchmark.problem.targets import draw_target, draw_targets
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment
 from tests.sample_experiments import spring_experiment
@@ -32,7 +33,7 @@ def test_targets_of_another_experiment_are_met_whole(spring):
     met = replace(other, name="mine", same_targets_as="spring-test", budget=5, seeds=1)
     own = replace(other, name="mine")
     for theirs, mine, apart in zip(
-        *(TuningProblem(e).draw_targets() for e in (other, met, own)), strict=True
+        *(draw_targets(TuningProblem(e)) for e in (other, met, own)), strict=True
     ):
         np.testing.assert_array_equal(everything(mine), everything(theirs))
         assert len(np.unique(everything(mine))) == 2 + 2 + 3 + 3 * 60 - 2, (
@@ -62,7 +63,7 @@ def test_a_comparison_meets_the_targets_of_another_and_searches_them_in_its_own_
 @pytest.mark.parametrize(("kind", "low", "high"), [("in", 2.0, 4.0), ("wide", 1.0, 5.0)])
 def test_start_and_true_parameters_are_drawn_evenly_from_their_range(kind, low, high, spring):
     problem = TuningProblem(spring_experiment())
-    drawn = [problem.draw_target(kind, i) for i in range(200)]
+    drawn = [draw_target(problem, kind, i) for i in range(200)]
     for rates in (
         np.array([target.truth[0] for target in drawn]),
         np.array([1.0 + 4.0 * target.blinded.start[0] for target in drawn]),
@@ -77,7 +78,7 @@ def test_every_channel_has_noise_of_its_own_size(spring):
     problem = TuningProblem(experiment)
     assert problem.scale.tolist() == [0.05, 0.5]
     left = []
-    for target in problem.draw_targets():
+    for target in draw_targets(problem):
         (scene,), theta = target.blinded.fitting.scenarios, target.truth[None]
         left.append(target.blinded.fitting.observed - problem.simulator.simulate(theta, scene)[0])
     spread = np.concatenate(left).std(axis=0)

@@ -5,6 +5,8 @@ import pytest
 from scipy.stats import chi2
 
 from bench.benchmark.problem.experiment_config import TunerEntry, load_experiment
+from bench.benchmark.problem.fisher_information import compute_target_spectrum
+from bench.benchmark.problem.targets import draw_target
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_in_worker import RunRequest, execute_run
 from bench.benchmark.runner.run_result_rows import build_rows
@@ -22,8 +24,8 @@ from bench.benchmark.runner.run_result_rows import build_rows
 def test_true_parameters_are_recovered_up_to_the_noise(name, index, budget, predicts):
     experiment = load_experiment(name)
     problem = TuningProblem(experiment)
-    target = problem.draw_target("in", index)
-    found = problem.compute_spectrum(target)
+    target = draw_target(problem, "in", index)
+    found = compute_target_spectrum(problem, target)
     order = RunRequest(
         "run", TunerEntry("least_squares", "least_squares"), 0, target.blinded, budget
     )

@@ -2,6 +2,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bench.benchmark.problem.targets import draw_targets
 from bench.benchmark.runner.experiment_runner import (
     ExperimentRun,
     prepare_experiment,
@@ -93,7 +94,7 @@ def test_pairing_all_tuners_share_target_start_and_true_parameters(two_workers):
 def test_obs_error_is_the_rmse_of_the_recommended_simulation(two_workers):
     rows = frame(two_workers).query("tuner == 'cma_es' and target == 'in-001' and seed == 1")
     problem = two_workers.problem
-    target = next(t for t in problem.draw_targets() if t.blinded.name == "in-001")
+    target = next(t for t in draw_targets(problem) if t.blinded.name == "in-001")
     for _, row in rows.iterrows():
         theta = np.array([[row["recommendation_rate"], row["recommendation_decay"]]])
         simulated = problem.simulator.simulate(theta, target.blinded.fitting.scenarios[0])[0]
@@ -103,7 +104,7 @@ def test_obs_error_is_the_rmse_of_the_recommended_simulation(two_workers):
 
 def test_tuner_that_searches_everything_finds_no_true_parameters():
     once = {"targets": 1, "seeds": 1, "ranges": ["in"]}
-    target = prepare_experiment(spring_experiment(**once)).problem.draw_targets()[0]
+    target = draw_targets(prepare_experiment(spring_experiment(**once)).problem)[0]
     cube = prepare_experiment(spring_experiment(**once)).problem.cube
     seen = target.blinded.fitting.observed.ravel()
     truths = np.concatenate([target.truth, cube.to_unit_cube(target.truth)])
@@ -140,7 +141,7 @@ def test_hanging_tuner_is_killed_at_its_limit(monkeypatch):
 def test_noise_is_added_to_the_target_only_and_sets_the_scale():
     experiment = spring_experiment(noise={"x": 0.05})
     problem = prepare_experiment(experiment).problem
-    targets = problem.draw_targets()
+    targets = draw_targets(problem)
     residuals = [
         t.blinded.fitting.observed
         - problem.simulate(problem.cube.to_unit_cube(t.truth)[None], t.blinded.fitting.scenarios)[0]
@@ -148,7 +149,7 @@ def test_noise_is_added_to_the_target_only_and_sets_the_scale():
     ]
     assert np.std(residuals) == pytest.approx(0.05, rel=0.1)
     assert problem.scale == pytest.approx([0.05])
-    again = prepare_experiment(experiment).problem.draw_targets()
+    again = draw_targets(prepare_experiment(experiment).problem)
     np.testing.assert_array_equal(
         targets[3].blinded.fitting.observed, again[3].blinded.fitting.observed
     )

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from bench.benchmark.problem.experiment_recording import ObservedRuns
+from bench.benchmark.problem.targets import draw_targets
 from bench.benchmark.problem.tuning_problem import ProposalEvaluator, TuningProblem
 from tests.sample_experiments import spring_experiment
 
@@ -10,7 +11,7 @@ pytestmark = pytest.mark.usefixtures("spring")
 
 def evaluator(**changes):
     problem = TuningProblem(spring_experiment(**changes))
-    side = problem.draw_targets()[0].blinded.fitting
+    side = draw_targets(problem)[0].blinded.fitting
     return problem, side, ProposalEvaluator(problem, side)
 
 

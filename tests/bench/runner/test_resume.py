@@ -10,6 +10,7 @@ import simgap
 from bench.benchmark.comparison_study import Comparison
 from bench.benchmark.problem.experiment_config import parse_experiment
 from bench.benchmark.problem.experiment_recording import ObservedRuns
+from bench.benchmark.problem.targets import draw_target
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_fingerprint import RunIds
 from bench.benchmark.runner.study_base import prepare_study
@@ -218,7 +219,7 @@ def test_a_finished_run_of_another_plan_is_refused(folder):
 
 def test_a_run_is_called_by_all_that_its_target_has(spring):
     experiment = spring_experiment(held_out={"scenarios": 1})
-    target = TuningProblem(experiment).draw_target("in", 0).blinded
+    target = draw_target(TuningProblem(experiment), "in", 0).blinded
     (scenario,), observed = target.fitting
 
     def with_side(name, **changes):

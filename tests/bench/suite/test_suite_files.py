@@ -14,9 +14,11 @@ from bench.benchmark.problem.experiment_config import (
     load_experiment,
 )
 from bench.benchmark.problem.missing_requirements import leave_out_missing_problems
+from bench.benchmark.problem.targets import draw_target
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import tuners
-from bench.studies.archive_bundle import verify_results, write_bundle
+from bench.studies.archive_bundle import write_bundle
+from bench.studies.result_verification import verify_results
 from bench.studies.study_kinds import begin_studies, report_jointly
 from bench.suite import suite_runs
 from bench.suite.suite_runs import read_suite_runs, write_suite_runs
@@ -115,7 +117,7 @@ def test_words_of_a_problem_may_change(tmp_path):
 def test_quantised_observations():
     (problem,) = [p for p in expand_sweep(load_experiment("suite")) if "quantised" in p.name]
     tuning = TuningProblem(problem)
-    observed = tuning.draw_target("in", 0).blinded.fitting.observed
+    observed = draw_target(tuning, "in", 0).blinded.fitting.observed
     steps = observed / 0.04
     assert np.abs(steps - np.round(steps)).max() < 1e-9
     assert len(np.unique(np.round(steps))) > 10

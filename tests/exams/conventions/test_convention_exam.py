@@ -22,7 +22,7 @@ from bench.diagnosis.conventions.corrected_description import (
 from bench.diagnosis.conventions.signal_changes import SignalChange
 from bench.diagnosis.conventions.unit_check import Subject
 from bench.logs.recording_loading import load_recording
-from sims.core.angles_and_quaternions import unwrapped
+from sims.core.angles_and_quaternions import unwrap_angle
 from sims.core.toml_validation import read_toml
 from sims.recording.recording_description import read_meta
 from tests.exams.conventions.convention_logs import BROKEN, CAUSES, write_log
@@ -128,8 +128,8 @@ def test_whole_turns_are_unwrapped_towards_the_command():
     wrapped = (angle + math.pi) % (2 * math.pi) - math.pi
     wrapped[7] = np.nan
     there = np.isfinite(wrapped)
-    assert unwrapped(wrapped)[there] == pytest.approx(angle[there])
-    later = unwrapped(wrapped, command=angle + 4 * math.pi + 0.1)
+    assert unwrap_angle(wrapped)[there] == pytest.approx(angle[there])
+    later = unwrap_angle(wrapped, command=angle + 4 * math.pi + 0.1)
     assert later[there] == pytest.approx(angle[there] + 4 * math.pi)
 
 

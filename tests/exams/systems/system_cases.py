@@ -17,9 +17,10 @@ from bench.diagnosis_benchmark.case_generation.case_sampling import (
     draw_case,
     restore_conditions,
 )
+from bench.diagnosis_benchmark.case_generation.equivalent_effects import find_equivalent_effects
 from bench.diagnosis_benchmark.case_generation.recording_conditions import SIMULATORS
 from bench.diagnosis_benchmark.case_generation.reference_simulation import UNMODELLED_CAUSES
-from bench.diagnosis_benchmark.case_set import find_equivalent_effects, write_case
+from bench.diagnosis_benchmark.case_set import write_case
 from bench.diagnosis_benchmark.grading import MAX_SET_SIZE, grade_answer
 from sims import effects as library
 from tests.exams.exam import (
@@ -104,7 +105,9 @@ class SystemCase(Case):
     def mark(self, outcome):
         item = self.item
         hidden_cause = HiddenCause(
-            item.kind, item.effects, lambda name: find_equivalent_effects(item, name)
+            item.kind,
+            item.effects,
+            lambda name: find_equivalent_effects(item.system, item.driven, name),
         )
         covered = grade_answer(item, outcome.verdict).covered
         return mark_answer(hidden_cause, outcome.verdict, STANDARD, self._sigmas_against, covered)

@@ -6,6 +6,7 @@ SciPy and MuJoCo agree about every effect, and unmodelled causes agree with clos
 import numpy as np
 import pytest
 
+from bench.diagnosis_benchmark.case_generation.input_and_sensor_effects import TrueSystem
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     SIMULATORS,
     draw_input_signal,
@@ -13,7 +14,6 @@ from bench.diagnosis_benchmark.case_generation.recording_conditions import (
 )
 from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     CHANNELS,
-    TrueSystem,
     simulate_with_mujoco,
     simulate_with_scipy,
 )

@@ -8,6 +8,7 @@ from sims.robot.loop_closure import (
     close_loops,
     coupled_joints,
     follow_measured_joints,
+    list_following_joints,
     list_joints_placed_by_loops,
     settle_loops,
 )
@@ -171,7 +172,7 @@ def test_unmeasured_joints_follow_a_measured_motion_that_the_model_would_not_mak
 def test_joints_follow_measured_ones_unless_a_drive_moves_them(write, driven, measured, following):
     actuator = f'<actuator><motor name="m" joint="{driven}"/></actuator></mujoco>'
     robot = read_robot(write(SLIDER_CRANK.replace("</mujoco>", actuator)))
-    assert make_robot_system(robot).list_following_joints(measured) == following
+    assert list_following_joints(robot, make_robot_system(robot).joint_loops, measured) == following
 
 
 def test_a_loop_that_cannot_close_keeps_its_states(write):

@@ -7,7 +7,7 @@ from sims import effects as library
 from sims.core.simulator import Scenario
 from sims.robot.dynamics.applied_inputs import compute_step_inputs
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
-from sims.robot.dynamics.tangent_propagation import (
+from sims.robot.dynamics.step_jacobians import (
     DifferenceQuotients,
     compute_runge_kutta_step,
     replace_diverging_points,

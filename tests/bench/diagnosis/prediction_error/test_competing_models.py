@@ -8,8 +8,9 @@ import pytest
 
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart
-from bench.diagnosis.prediction_error import competing_models, single_effect_fits
+from bench.diagnosis.prediction_error import competing_models
 from bench.diagnosis.prediction_error.effects_at_joints import list_joint_model_effects
+from bench.diagnosis.search import fit_starts
 from sims.effects.drag import LinearDrag
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
@@ -54,9 +55,7 @@ def test_a_competing_effect_is_simulated_at_several_coefficients(
 
     monkeypatch.setattr(competing_models, "is_explained", lambda *_: True)
     monkeypatch.setattr(competing_models, "select_lowest_of_each", simulate)
-    monkeypatch.setattr(
-        single_effect_fits, "compute_coefficient_bounds", lambda *_: [(-np.inf, np.inf)]
-    )
+    monkeypatch.setattr(fit_starts, "compute_coefficient_bounds", lambda *_: [(-np.inf, np.inf)])
     base, best = (SimpleNamespace(fit=SimpleNamespace(cost=cost)) for cost in (1000.0, 100.0))
     context = SimpleNamespace(
         search=SimpleNamespace(base_model=base),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart
-from bench.diagnosis.prediction_error import elasticity_and_backlash_fits, single_effect_fits
+from bench.diagnosis.prediction_error import elasticity_and_backlash_fits as series_fits
 from bench.diagnosis.prediction_error.elasticity_and_backlash_fits import (
     SMALLER_SERIES_SHARES,
     add_series_effect,
@@ -25,7 +25,7 @@ def simulated(example_arm, monkeypatch):
 
     The wrong selection has moved the largest missing force from the first to the second joint.
     """
-    monkeypatch.setattr(single_effect_fits, "select_lowest_of_each", lambda _, starts: starts)
+    monkeypatch.setattr(series_fits, "select_lowest_of_each", lambda _, starts: starts)
     context = SimpleNamespace(
         evaluator=example_arm,
         filters=SimpleNamespace(
@@ -96,8 +96,8 @@ def test_early_only_effects_that_remove_most_of_the_residual_are_fitted(
         fitted.extend(name for start in started for name in start.effects)
         return [SimpleNamespace(fit=SimpleNamespace(make_start=lambda: None))]
 
-    monkeypatch.setattr(single_effect_fits, "select_likeliest", lambda *models: models[0])
-    monkeypatch.setattr(single_effect_fits, "fit_by_simulation", lambda *_: None)
+    monkeypatch.setattr(series_fits, "select_likeliest", lambda *models: models[0])
+    monkeypatch.setattr(series_fits, "fit_by_simulation", lambda *_: None)
     search = SimpleNamespace(
         base_model=SimpleNamespace(fit=SimpleNamespace(cost=BASE_COST)),
         models={frozenset(["joint.flexibility@elbow"]): None},
@@ -112,9 +112,9 @@ def test_a_transmission_is_added_at_the_joint_where_the_best_model_lacks_a_force
     example_arm, monkeypatch, has_series
 ):
     """As for an elastic elbow with ripple at the shoulder, which is found first."""
-    monkeypatch.setattr(single_effect_fits, "select_lowest_of_each", lambda _, starts: starts)
-    monkeypatch.setattr(single_effect_fits, "remove_idle_effects", lambda _, model: model)
-    monkeypatch.setattr(single_effect_fits, "select_likeliest", lambda *models: models[-1])
+    monkeypatch.setattr(series_fits, "select_lowest_of_each", lambda _, starts: starts)
+    monkeypatch.setattr(series_fits, "remove_idle_effects", lambda _, model: model)
+    monkeypatch.setattr(series_fits, "select_likeliest", lambda *models: models[-1])
     theta = example_arm.get_nominal_theta()
     theta[example_arm.coefficient_slices["friction.coulomb@shoulder"]] = 0.3
     first = "joint.backlash@elbow" if has_series else "friction.coulomb@shoulder"
@@ -129,7 +129,7 @@ def test_a_transmission_is_added_at_the_joint_where_the_best_model_lacks_a_force
         assert limit == BASE_COST
         return SimpleNamespace(effects=("added",))
 
-    monkeypatch.setattr(elasticity_and_backlash_fits, "fit_series_effects", fit_added)
+    monkeypatch.setattr(series_fits, "fit_series_effects", fit_added)
     context = SimpleNamespace(
         evaluator=example_arm,
         filters=SimpleNamespace(get_filter=lambda _: SimpleNamespace(joints_by_loss=[1, 0])),

@@ -1,11 +1,9 @@
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
+from bench.diagnosis.evaluation.noise_model import compute_sigma_standard_error
 from bench.diagnosis.search.lack_of_fit import (
     HatForce,
-    _compute_sigma_standard_error,
     assess_lack_of_fit,
     compute_hat_directions,
 )
@@ -105,9 +103,7 @@ def test_noise_that_is_larger_than_stated_is_structure():
 @pytest.mark.parametrize(("phi", "samples"), [(0.0, 1.0), (0.6, 0.64 / 1.36), (-0.6, 0.64 / 1.36)])
 def test_autocorrelated_noise_is_estimated_less_precisely(phi, samples):
     """AR(1) noise reduces the effective number of samples (Bartlett's formula)."""
-    models = SimpleNamespace(observed_mask=np.ones((2, 100, 1), dtype=bool))
-    model = SimpleNamespace(likelihood=SimpleNamespace(phi=np.array([phi])))
-    assert _compute_sigma_standard_error(models, model, 0) == pytest.approx(
+    assert compute_sigma_standard_error(phi, 200) == pytest.approx(
         1 / np.sqrt(2 * 200 * samples), rel=1e-12
     )
 

@@ -15,7 +15,7 @@ from bench.diagnosis.search.score_test import (
     compute_calibrated_scores,
     compute_explained_squares,
     estimate_tail_p_value,
-    group_directions,
+    group_probes,
 )
 from bench.diagnosis.search.whitened_products import InnerProducts, WhiteningDesign
 from tests.bench.diagnosis.explained_samples import correlated, covariance_of, linear_fit
@@ -226,7 +226,7 @@ def test_directions_of_an_effect_act_together_within_a_group():
         CandidateDirection("a", 0, 1, np.ones(2), False),
         CandidateDirection("a", 1, 0, np.ones(2), True),
     ]
-    made = group_directions(DirectionSet(tuple(marked), np.zeros((1, 1, 1, 3))))
+    made = group_probes(marked)
     assert [(g.column_indices, g.positive) for g in made] == [
         ((0, 1), (False, True)),
         ((2,), (False,)),

@@ -1,14 +1,15 @@
-"""Tests of the conditions on a diagnosis of a robot that touches something."""
+"""Tests of the choice of the filter for a robot that touches something."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from bench.diagnosis.pipeline.contact_conditions import (
+from bench.diagnosis.pipeline.run_filtering import (
     MAX_JOINTS_OF_NONLINEAR_FILTER,
-    ContactConditions,
+    needs_nonlinear_filter,
 )
+from bench.diagnosis.pipeline.simulated_runs import ContactConditions
 
 
 @pytest.mark.parametrize(
@@ -32,4 +33,5 @@ def test_contacts_that_need_a_large_force_need_a_nonlinear_filter(
     force[-1] = force_share
     filtered_runs = SimpleNamespace(force=force, typical=np.ones(joints))
     conditions = ContactConditions(SimpleNamespace(has_model=True, robot=robot))
-    assert conditions.needs_nonlinear_filter(filtered_runs) == expected
+    runs = SimpleNamespace(contacts=conditions, nominal_filter=filtered_runs)
+    assert needs_nonlinear_filter(runs) == expected

@@ -270,7 +270,7 @@ def test_forms_are_compared_if_friction_leaves_more_than_noise(
     said, results = [], {"stiff": make_result(verdict), "soft": make_result(soft_verdict)}
     soft_model = SimpleNamespace(fit=SimpleNamespace(make_start=lambda: "soft start"))
     monkeypatch.setattr(cause_search, "has_dry_friction", lambda _, names: bool(names))
-    monkeypatch.setattr(cause_search, "refit_if_likelier_soft", lambda *_: soft_model)
+    monkeypatch.setattr(dry_friction_fits, "refit_if_likelier_soft", lambda *_: soft_model)
     monkeypatch.setattr(cause_search.CauseSearch, "_find_causes", lambda *_: results["stiff"])
     monkeypatch.setattr(
         cause_search.CauseSearch, "_search_with_soft_friction", search_with_soft_friction
