@@ -233,6 +233,7 @@ def read_extended(path: Path) -> ExtendedSimulator:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):  # it is also used for files
         raise make_error(path, "name", "letters, digits, '_', '.' and '-'", name)
     robot = robot_reference.read_robot_reference(path, document) if "model" in document else None
+    # A robot has the name of its model file, and states its engine in its own entries.
     system, engine = (robot.path.stem, None) if robot else _read_system(path, document)
     expected = "a list of channel names"
     observe = check_name_list(path, "observe", document.get("observe", []), expected)
@@ -406,6 +407,7 @@ def _make_subclass(
     body = {
         "__init__": __init__,
         "system": kind.system,
+        # By this attribute, other code recognises an extended simulator.
         "extends": extended.system,
         # These classes have the same source code and may have the same name. The digest of their
         # numbers distinguishes them; otherwise a tuner trained in one would count as trained in

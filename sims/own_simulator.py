@@ -392,11 +392,12 @@ class OwnSimulatorEngine:
             batch: Batch of this element alone.
 
         Returns:
-            (N, C) readings of C channels, at the start and after each `steps_per_sample` steps.
+            (N, C) N readings of C channels, at the start and after each `steps_per_sample` steps.
             None if a parameter, constant or initial state is not finite.
         """
         system = batch.system
         world = self.world
+        # The arrays of this batch have one row, that of its only element.
         names = [p.name for p in system.parameters]
         theta = dict(zip(names, batch.theta[0].tolist(), strict=True))
         constants = {name: float(value[0, 0]) for name, value in batch.constants.items()}
@@ -417,7 +418,7 @@ class OwnSimulatorEngine:
         steps[moving] = equalise_steps(steps[moving], batch.steps_per_sample)
         sample = self._row(system)
         time = 0.0
-        has_moved = False
+        has_moved = False  # whether a step was made after the last reading
         samples = [sample]
         for step_index, seconds in enumerate(steps.tolist()):
             if seconds > 0:
@@ -509,6 +510,7 @@ class _Forces:
             inputs: Inputs by name.
             seconds: Length of the step, s.
         """
+        # The arrays of one element have a single row, hence (1, D) here and [0] below.
         observation = self.world.observe()
         x = self._read_state(observation, self.world.coordinates)
         v = self._read_state(observation, self.world.rates)
@@ -614,7 +616,7 @@ def _make_simulator_error(world: OwnSimulator, error: Exception) -> InputError:
     module_frames = [
         frame for frame in frames if frame.filename == getattr(module, "__file__", None)
     ]
-    frame = (module_frames or list(frames))[-1]
+    frame = (module_frames or list(frames))[-1]  # the innermost call is the last one
     description = f"{type(error).__name__}: {error}"
     location = f"{Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
     return InputError(f"simulator {world.name}: {description} ({location})")

@@ -220,7 +220,7 @@ class SystemSimulator(Simulator):
             (L, T, C) observations; NaN after the end of shorter runs and for failed elements.
         """
         active_effects = self._make_active_effects(theta)
-        runs = group_scenarios(scenarios)
+        runs = group_scenarios(scenarios)  # scenarios with equal content count as one
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
         with np.errstate(all="ignore"):  # batch elements that overflow become NaN
             grid, inputs = self._compute_steps_and_inputs(
@@ -229,7 +229,8 @@ class SystemSimulator(Simulator):
             sensors = tuple(
                 (effect, c) for effect, c in _select_effects(active_effects, Sensor) if c.any()
             )
-            # A sensor filter needs every step; other sensor effects need the samples only.
+            # A sensor filter needs the state after every step; other sensor effects need the states
+            # at the samples only.
             is_filtered = any(needs_every_step(effect) for effect, _ in sensors)
             steps_per_state = 1 if is_filtered else grid.steps_per_sample
             base_theta = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
@@ -286,12 +287,14 @@ class SystemSimulator(Simulator):
             c.any() and (isinstance(effect, Input) or shifts_time(effect)) for effect, c in acting
         )
         has_shift = any(scenario.offset for scenario in runs.unique_scenarios)
-        # The content of the scenarios is the key; without it, nothing can be looked up.
+        # `runs.contents`, the content of the distinct scenarios, is the key of the stored steps; it
+        # is empty if unknown.
         if has_effect or has_shift or not runs.contents:
             return compute(runs, acting)
         stored = self._stored_steps.get(runs.contents)
         if stored is None:
-            # One row for each distinct scenario; without effects, as none of them acts here.
+            # `runs.one_each` has each distinct scenario once. Effects are left out, as none of them
+            # acts here.
             grid, _ = stored = compute(runs.one_each, ())
             if len(self._stored_steps) >= MAX_STORED_TIME_GRIDS:  # the oldest makes room
                 del self._stored_steps[next(iter(self._stored_steps))]

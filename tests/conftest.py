@@ -2,6 +2,7 @@ import gc
 import os
 import signal
 from collections import Counter
+from importlib.util import find_spec
 from pathlib import Path
 from zlib import crc32
 
@@ -35,11 +36,23 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # background jobs ignore 
 
 
 def pytest_configure(config):
-    """Compile the native kernel before pytest starts its workers, which would all wait for it."""
+    """Compile native code before pytest starts its workers, which would all wait for it.
+
+    Compiling is reported once on stderr, where some tests expect nothing.
+    """
     if not hasattr(config, "workerinput"):
+        from bench.diagnosis.kalman import kalman_recursions
+        from sims.effects import compiled_recursions
         from sims.engines.compiled import element_stepping
 
-        element_stepping.COMPILED.load()
+        for module in (element_stepping, compiled_recursions, kalman_recursions):
+            module.COMPILED.load()
+        if find_spec("mujoco") is not None:
+            from sims.robot.dynamics.mujoco_callback import find_data_offsets, load_callback
+
+            offsets = find_data_offsets()
+            if offsets is not None:
+                load_callback(offsets)
 
 
 def pytest_collection_finish():

@@ -128,6 +128,9 @@ def build_experiment(
         options: Options of the comparison. With a command of a language model, this model is
             compared as well.
 
+    Returns:
+        The experiment with all changes; it may still sweep over values or name others.
+
     Raises:
         InputError: The experiment, a tuner or a plugin does not exist or cannot be used, or the
             options do not name either an experiment or a robot.
@@ -160,6 +163,7 @@ def build_experiment(
         # Workers inherit the environment.
         os.environ[language_model.COMMAND_VARIABLE] = options.model_command
         labels = [*(labels or ()), language_model.LanguageModel.name]
+    # An option that was not given is None, and changes nothing.
     changes = {name: getattr(options, name) for name in _EXPERIMENT_OPTIONS}
     return apply_changes(complete, labels, options.seeds, changes)
 
@@ -188,6 +192,8 @@ def begin_studies(
     report_missing: Callable[[str, str], None] = _warn_of_missing_problem,
 ) -> list[Study]:
     """Plan the studies of an experiment in new folders, without running them.
+
+    There are several if the experiment sweeps over values or names other experiments.
 
     Args:
         experiment: Experiment, from `build_experiment`.

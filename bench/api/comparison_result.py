@@ -100,7 +100,7 @@ class ComparisonResult:
 
     @property
     def _study_kind(self) -> str:
-        """Name of this kind of study_kinds, for messages."""
+        """Kind of the study in words, for messages."""
         if self.experiment.diagnosis:
             return "a comparison of diagnosers"
         return "a bounce shot" if self.experiment.shot else "a study of two comparisons"
@@ -222,6 +222,7 @@ class ComparisonResult:
             return table
         import pandas as pd
 
+        # Rows after the whole budget, and among them those of the metric that the table has first.
         last_rows = table[table["simulations"] == table["simulations"].max()]
         rows = last_rows[last_rows["metric"] == last_rows["metric"].iloc[0]]
         # The verdict of the ranking after all simulations, in the order of these rows.

@@ -67,10 +67,12 @@ def datasheet(recording: Sources, options: DatasheetOptions) -> DataSheet:
         extended, verdict = explained.extended, explained.answer
     else:
         extended, verdict = _read_explanation_folder(Path(explained))
+    # The numbers of a robot's model file that were tuned; other systems have no such file.
     free = extended.robot.free if extended.robot is not None else ()
     loaded, kind = load_joined(
         sources, options.system, options.model, free, fix_base=options.fix_base
     )
+    # Both are simulator classes: that of the explained system, and that of the logs.
     if extended.kind is None or kind.name != extended.kind.name:
         raise InputError(
             f"{loaded.path}: expected a recording of {extended.system}, as for the explanation; "
@@ -101,7 +103,11 @@ def check_joint_exists(
 
 
 def _read_explanation_folder(folder: Path) -> tuple[ExtendedSimulator, Verdict]:
-    """Read the results that explain has written to a folder."""
+    """Read the results that explain has written to a folder.
+
+    Returns:
+        The extended simulator with its simulator class, and the verdict.
+    """
     verdict = read_verdict(folder)
     extended, kind, _ = open_extended(folder / "extended.toml", simulators.get)
     return replace(extended, kind=kind), verdict

@@ -31,15 +31,16 @@ def score(
 
     Args:
         model: Path of extended.toml, or of a robot's model file, such as extended.xml.
-        recording: As for `explain`; a DataFrame is of the model's system.
-        units: As for `explain`.
-        constants: As for `explain`.
-        description: As for `explain`.
+        recording: Path of the recording's CSV table, or a DataFrame of the model's system.
+        units: Units of a DataFrame's columns by name.
+        constants: Known numbers of the system in SI units, with a DataFrame.
+        description: Any other entries about a DataFrame, with the keys of ``NAME.toml``.
         held_out: Whether to use only runs that are marked as held out.
-        force: As for `explain`.
+        force: Whether to score a recording that is refused otherwise, as for `explain`.
 
     Returns:
-        rmse by channel in its unit, normalised_rmse in units of the noise, runs, samples, units.
+        ``rmse`` by channel in its unit, ``normalised_rmse`` in units of the noise, the numbers of
+        ``runs`` and ``samples``, and the ``units`` of the channels.
 
     Raises:
         InputError: A file cannot be read, or the recording is of another system.
@@ -65,6 +66,7 @@ def _fill_in_from_model_file(model: Path, frame_description: FrameDescription) -
     if model.suffix in MODEL_FILES:
         return replace(frame_description, model=model)
     extended = extended_file.read_extended(model)
+    # What the file states about a robot: its model file, actuators and engine; None for a system.
     robot = extended.robot
     if robot is None:
         return replace(frame_description, system=extended.system)

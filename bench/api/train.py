@@ -68,7 +68,7 @@ def select_training(
     if experiment is None and simulator in set(list_experiment_names()) - set(simulators.names()):
         experiment = simulator
         simulator = load_experiment(experiment).simulator
-    # A robot's simulator is not registered; it is defined by its experiment.
+    # A robot's simulator is not registered; its experiment names the model file that defines it.
     has_model = experiment is not None and load_experiment(experiment).model
     # A simulator of a plugin is only known when the plugin is loaded, below.
     if not plugins and not has_model:
@@ -116,9 +116,15 @@ def run_training(
         watch: Callback that observes the training.
         again: Whether to train even if there is an earlier training.
 
+    Returns:
+        File of the trained weights, and simulations and seconds of the training.
+
     Raises:
         TrainingBudgetTooSmallError: The training budget is too small.
+        RunEndedError: The tuner failed in its isolated process.
     """
+    # Without a specification the tuner trains in this process. An isolated process must not see the
+    # folder of weights, which has earlier trainings.
     request = TrainingRequest(entry, seed)
     if not experiment.trusted:
         request = TrainingRequest(
@@ -205,6 +211,7 @@ class LossRecorder:
             loss: Training loss.
             held_out: Held-out loss.
         """
+        # A new stage gets a progress bar of its own.
         if stage != self._stage:
             self._stage = stage
             self._step = self.start(f"{self._title}, {stage}", epochs)

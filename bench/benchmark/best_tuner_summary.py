@@ -243,7 +243,11 @@ def explain_first(worse: Sequence[str]) -> list[str]:
 
     Args:
         worse: texts of tuners that are significantly worse than the best one.
+
+    Returns:
+        The texts; only the first one is changed.
     """
+    # A text without a factor does not match, and stays as it is.
     first = [
         re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", text)
         for text in worse[:1]

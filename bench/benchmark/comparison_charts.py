@@ -226,6 +226,7 @@ def make_misfit_chart(view: ComparisonView) -> ComparisonChart:
     # There is one panel for each range, in this order.
     for panel, kind in zip(chart.panels, view.ranges, strict=False):
         runs = view.statistics.select_range(kind)
+        # Smallest misfit of any tuner on each target, and its median over targets.
         smallest = float(runs.groupby("target")["obs_error"].min().median())
         text = f"smallest that any tuner reached: {format_number(smallest, 2)} (median)"
         panels.append(replace(panel, rules=(ReferenceLine(smallest, text), *panel.rules)))
@@ -413,11 +414,14 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
     for level in view.levels:
         costs = view.statistics.tuning_costs[level]
         table = build_time_per_target_table(costs)
+        # Position of each point on its tuner's curve; the curves are smooth, so a part of the
+        # points is enough.
         point_index = table.groupby(["range", "tuner"]).cumcount()
         tables.append(table[point_index % _THINNING_STEP == 0].assign(threshold=level))
         for kind in view.ranges:
             winners = list(find_cheapest_tuners(costs.get(kind, {}), TARGETS_PER_TRAINING))
             mark_styles = view.get_tuner_styles(tuner for _, _, tuner in winners)
+            # `foot`: a strip at the bottom of the panel, not its whole height.
             spans = tuple(
                 AxisSpan(low, high, tuner, mark_styles[tuner], foot=True)
                 for low, high, tuner in winners
@@ -566,6 +570,9 @@ def _make_tuner_series(
         low: column of the lower end of the interval; empty for none.
         high: column of the upper end.
         where: values of further columns, by which the rows are selected.
+
+    Returns:
+        Series in the order of the legend, the best tuner first.
     """
     styles = view.get_tuner_styles(table["tuner"])
     # Points of several tuners in one category are shifted, so that they lie side by side.
@@ -631,6 +638,7 @@ def find_coinciding_curves(
             # A tuner that misses a panel covers nothing there.
             if len(upper_curves) != len(curves):
                 continue
+            # Number of simulations up to which the two look the same in every panel.
             last_equal = min(map(_count_equal_simulations, curves, upper_curves))
             has_progress = any(
                 (curve.loc[:last_equal] < 0.5 * curve.iloc[0]).any() for curve in curves

@@ -201,6 +201,9 @@ def draw_with_references(
 ) -> list[dict[str, Any]]:
     """Draw a comparison's figures again with references behind them, as separate files.
 
+    A reference is a stored comparison of the same problem, whose medians are drawn in grey. Only
+    the figures in `OVERLAYABLE_FIGURES` can show references.
+
     Args:
         folder: folder of the comparison.
         references: reference results to draw.
@@ -264,10 +267,15 @@ def check_references_allowed(
 def _draw_chart_figure(
     view: ComparisonView, name: str, references: Sequence[ReferenceResult]
 ) -> Figure:
-    """Draw the figure called `name`, one of `CHARTS`, with the same panels as on the report page.
+    """Draw a printed figure of one of the charts of the report page.
 
-    `references` are the results of other comparisons; they are drawn in grey behind those of
-    `view`.
+    Args:
+        view: comparison with its statistics, experiment and styles of tuners.
+        name: name of the chart, a key of `CHARTS`.
+        references: results of other comparisons, drawn in grey behind those of `view`.
+
+    Returns:
+        Figure with legend, title and caption.
     """
     chart, layout = CHARTS[name](view), _LAYOUTS[name]
     # A facet is a property of a panel that a reader of the page can choose, such as the range. A
@@ -343,6 +351,7 @@ def _finish_figure(
         caption: Caption below the figure.
         heading: Title of the legend.
     """
+    # Matplotlib's handle of a legend entry, by the label of its tuner.
     handle_by_label: dict[str, Any] = {}
     # A panel may lack a tuner that another panel has; of several handles the first panel's is used.
     for axis in reversed(axes):
@@ -356,6 +365,7 @@ def _finish_figure(
     for reference in style.references:
         legend_entries += _make_reference_entries(axes, style, reference)
         caption += _format_reference_caption(reference, style.experiment)
+    # Size of the letters in points; a long legend has small letters.
     size = 9.0 if len(legend_entries) <= _MAX_LEGEND_ROWS else 7.0
     figure.legend(
         [handle for handle, _ in legend_entries],
@@ -367,6 +377,7 @@ def _finish_figure(
         frameon=False,
         handlelength=3.2,
     )
+    # A label that all panels share is written once, at the first panel.
     for axis in axes[1:]:
         if axis.get_ylabel() == axes[0].get_ylabel():
             axis.set_ylabel("")
@@ -453,7 +464,8 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
 
     Args:
         axis: axes to draw on.
-        table: one row for each target and direction: standard error, and range of the target.
+        table: one row for each target and direction: number of the direction from 1, standard error
+            in widths of the training range, and range of the target.
         directions: number of directions.
     """
     ranges = list(dict.fromkeys(table["range"]))
@@ -462,6 +474,7 @@ def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
     ):
         range_rows = table[table["range"] == kind]
         targets = range_rows["target"].nunique()
+        # Position of the target among those of the range, from 0.
         target_indices = range_rows.groupby("direction").cumcount()
         target_offsets = (
             # Marks of the targets are spread over 0.3 of the distance of two directions.
@@ -515,6 +528,7 @@ def _draw_direction_shares(axis: Axes, table: pd.DataFrame, names: list[str]) ->
     """
     # A direction has length 1: its squared components are shares, independent of their signs.
     squares = table.set_index("direction")[names] ** 2
+    # Means over the targets, one row per parameter and one column per direction.
     shares = squares.groupby(level=0).mean().to_numpy().T
     axis.imshow(shares, cmap="Greys", vmin=0.0, vmax=1.0, aspect="auto")
     for row, column in np.argwhere(shares >= _MIN_LABELLED_SHARE):

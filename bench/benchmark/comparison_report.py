@@ -208,7 +208,8 @@ def render_page(results: ComparisonReportData) -> str:
         page.add_tables(chart.tables if chart else {}, _PAGE_DIGITS)
     statuses = view.stored.statuses
     values = _collect_text_values(results)
-    # Rankings by range; `together` has those of all ranges after the same number of simulations.
+    # A list for each range, with its rankings after 1, 3, 10 and all simulations. `together` has
+    # one element for each of these numbers: the rankings of all ranges after it.
     rankings = [result.rankings for result in values["range_results"]]
     return page.render(
         _PAGE_TEMPLATE,
@@ -272,8 +273,9 @@ def _list_error_tables(
         view: the comparison.
 
     Yields:
-        Range, metric and table; the table of errors along directions, None if there are none, and
-        whether it has errors in unseen scenarios.
+        Range; name of the metric; its median errors, one row per tuner, best first, and one column
+        per number of simulations; the table of `_build_direction_errors`, None if there is none;
+        and whether that table has errors in unseen scenarios.
     """
     metrics, statistics = set(lines["metric"]), view.statistics
     # The row of a skipped tuner has no range.
@@ -283,6 +285,7 @@ def _list_error_tables(
         preferred = ("heldout_error", "obs_error") if kind == "real" else ("param_abs_error",)
         metric = next((name for name in preferred if name in metrics), "param_error")
         medians = build_summary(lines, metric, kind, statistics.order_in(kind))
+        # Number of simulations of a training, 0 for a tuner that is not trained.
         training = lines.drop_duplicates("tuner").set_index("tuner")["fit_simulations"]
         medians["trained on"] = [
             f"{training[tuner]:.0f}" if training[tuner] else "-" for tuner in medians.index
@@ -295,7 +298,7 @@ def _list_error_tables(
 def _build_direction_errors(
     lines: pd.DataFrame, kind: str, view: ComparisonView
 ) -> tuple[pd.DataFrame | None, bool]:
-    """Build the table of errors along directions, and of held-out errors, of one range.
+    """Build the table of median errors along directions, and of held-out errors, of one range.
 
     A column is a kind of error after some number of simulations, such as ``stiff 10``: the error
     along directions of the parameter space that the data determine (stiff), along those that they
@@ -307,7 +310,8 @@ def _build_direction_errors(
         view: the comparison.
 
     Returns:
-        The table, None without such errors; and whether it has held-out errors.
+        The table, one row per tuner, the best first, None without such errors or for a recording;
+        and whether it has held-out errors.
     """
     statistics = view.statistics
     titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}

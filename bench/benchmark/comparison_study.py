@@ -99,8 +99,12 @@ class Comparison(Study):
     def _attach(self, results: ExperimentRun) -> None:
         """Prepare the comparison for running: open its journal, write or check its plan.
 
-        `results` are the problem and the planned runs. A finished comparison has no journal any
-        more; then its tables are compared with the plan.
+        The plan is the list of all run ids; the journal is the file to which each run is appended
+        when it ends. A finished comparison has neither file; then its tables are compared with the
+        plan.
+
+        Args:
+            results: the problem and the planned runs; the journal is added to it.
 
         Raises:
             InputError: the stored plan or runs do not belong to the configuration.

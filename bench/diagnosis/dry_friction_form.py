@@ -32,7 +32,8 @@ def make_soft_kind(kind: type[SystemSimulator]) -> type[SystemSimulator]:
 def has_dry_friction(evaluator: RunEvaluator, names: Iterable[str]) -> bool:
     """Return whether effects or freed numbers of a robot contain dry friction.
 
-    Only then the form of dry friction matters.
+    Freed numbers are numbers of the model file that are fitted. Only with dry friction its form
+    (stiff or MuJoCo's soft one) matters.
 
     Args:
         evaluator: Run evaluator; its simulator may be a robot.
@@ -84,10 +85,12 @@ def add_solver_parameters(evaluator: RunEvaluator, name: str, description: str) 
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     # An effect at several joints has a member for each, with the index of the joint's coordinate.
     members = members_of(type(evaluator.available_effects[name]))
+    # Index of the degree of freedom of each joint in the compiled MuJoCo model.
     dofs = [joints[m.coordinate].velocity for m in members if m.coordinate is not None]
     # Pairs of time constant and damping ratio, which joints may share.
     parameters = sorted({tuple(robot.compiled.dof_solref[dof].tolist()) for dof in dofs})
     text = " or ".join(" ".join(f"{value:g}" for value in pair) for pair in parameters)
+    # The place in brackets, if there is one, stays at the end.
     sentence, bracket, place = description.partition(" (at ")
     sentence = sentence.removesuffix(_STICTION_TEXT)
     return f"{sentence}, in MuJoCo's soft form (solreffriction {text}){bracket}{place}"

@@ -193,7 +193,8 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
         InputError: The conventions of the recording contradict the model file, or no fit of the
             base model can simulate the recording.
     """
-    # They store what they find: wrong units, and numerical settings that differ from the file.
+    # These objects keep what they find: wrong units, and numerical settings that differ from the
+    # file.
     error_check = RecordingErrorCheck()
     step_choice, option_choice = TimeStepChoice(), SolverOptionChoice()
     # 1. Conventions.
@@ -217,6 +218,7 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
             return model
         if not runs.kind.has_model:
             return model.widen_ranges()
+        # None if whole runs can be used.
         segment_duration = find_segment_duration(model) if may_divide else None
         if segment_duration is not None:
             raise DivergingSimulationError(
@@ -245,6 +247,7 @@ def _diagnose_runs(runs: SimulatedRuns, may_divide: bool) -> _Diagnosis:
     # 3. Causes.
     cause_search = CauseSearch(error_check)
     result = step_choice.reconsider(cause_search.search(base), cause_search)
+    # Other solver options are only tried with the time step of the model file.
     if step_choice.finding is None:
         result = option_choice.reconsider(result, cause_search)
     # 4. Explanation.

@@ -91,7 +91,8 @@ def select_written_causes(
         base_joints: Names of the coordinates of floating bodies.
 
     Returns:
-        The selected causes, and a line for each number that is left out.
+        The selected causes, and a line for each effect and place that is left out, with a number
+        that is not a result.
     """
     selected_causes: dict[str, Mapping[str, FittedValue]] = {}
     causes, left_out = _leave_out_base_effects(causes, base_joints)
@@ -99,7 +100,8 @@ def select_written_causes(
         if effect.startswith("numerics."):
             selected_causes[effect] = coefficients
             continue
-        # Each place of a family is handled alone; coefficients of one place belong together.
+        # Each place of a family is handled alone; coefficients of one place belong together. So one
+        # number that is not a result, by its place, leaves out all numbers of this place.
         unidentified = {
             _get_place(key): fitted_value
             for key, fitted_value in coefficients.items()
@@ -113,7 +115,7 @@ def select_written_causes(
         if selected_values:
             selected_causes[effect] = selected_values
         for place, fitted_value in unidentified.items():
-            # A number that was never fitted has the value of the model file.
+            # A number that was never fitted is zero and changes nothing, so it needs no line.
             if fitted_value.at_bound is None and not fitted_value.value:
                 continue
             end = {"low": "lower", "high": "upper", None: ""}[fitted_value.at_bound]

@@ -160,6 +160,7 @@ def assess_identifiability(
         Free parameters first, then causes, those with the narrowest intervals first.
     """
     if direction_set is None:
+        # An effect at all places is represented by those at single places.
         names = [
             name
             for name in evaluator.library
@@ -257,17 +258,21 @@ class _IdentifiabilityAssessment:
     def _project_out_states(self, columns: Array) -> Array:
         """Project the initial states of each run out of k columns (R, n, k); return (R n, k).
 
+        A column is the derivative of all samples by a parameter, or the response to an effect.
         What a change of the initial states could explain gives no information on a parameter. The
         prior of the initial states limits their change: it is added to the normal equations of the
         least-squares fit of each column by the derivatives `states` (R, n, s). An unstable motion
         has nearly parallel derivatives, which the scaled inverse allows.
 
         Shapes: R runs, n samples times channels of a run, s states of a run.
+
+        Args:
+            columns: (R, n, k) columns in units of the noise, zero where nothing is recorded.
         """
         state_jacobian = self.states
         precision = np.diag(compute_state_prior(self.evaluator) ** -2.0)
         normal = np.matmul(state_jacobian.transpose(0, 2, 1), state_jacobian) + precision
-        inverse = np.array([invert_scaled(of_run, of_run) for of_run in normal])
+        inverse = np.array([invert_scaled(run_normal, run_normal) for run_normal in normal])
         coefficients = inverse @ np.matmul(state_jacobian.transpose(0, 2, 1), columns)
         projected: Array = columns - np.matmul(state_jacobian, coefficients)
         runs, samples, count = projected.shape
@@ -294,12 +299,13 @@ class _IdentifiabilityAssessment:
     def _assess_free_parameters(self) -> list[ParameterIdentifiability]:
         """Assess all free parameters from their joint covariance (D'D)^-1, eq. (1).
 
-        The columns of D are the whitened derivatives `self.parameters` (samples, parameters). A
-        parameter without any influence has an infinite variance.
+        The columns of D are the derivatives `self.parameters` (samples, parameters) in units of the
+        noise. A parameter without any influence has an infinite variance, and so has one to which
+        the runs are insensitive, which the fit has frozen.
         """
         curvature = self.parameters.T @ self.parameters
         covariance = invert_scaled(curvature, curvature)
-        # Standard error of each parameter.
+        # Standard error of each parameter; infinite without influence.
         errors = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         errors = np.where(np.diagonal(curvature) > 0, errors, np.inf)
         correlations = np.abs(covariance / np.outer(errors, errors))
@@ -316,7 +322,7 @@ class _IdentifiabilityAssessment:
             assessments.append(
                 _classify_parameter(parameter.name, True, parameter, Z95 * error, confounders)
             )
-        # The fit has frozen parameters to which the runs are insensitive.
+        # Parameters to which the runs are insensitive: they are frozen, so D has no column of them.
         for index in sorted(set(self.evaluator.base_indices.tolist()) - set(free_indices)):
             parameter = self.evaluator.parameters[index]
             assessments.append(_classify_parameter(parameter.name, True, parameter, np.inf, ()))
@@ -343,7 +349,7 @@ class _IdentifiabilityAssessment:
             parameter_index = evaluator.get_coefficient_indices(name)[coefficient_index]
             parameter = evaluator.parameters[parameter_index]
             probe, norm = direction.probe, direction.norm
-            # The standard error of a coefficient is 1 / norm.
+            # The direction is in units of the noise, so the standard error is 1 / norm.
             half_width = Z95 / norm if norm > 0 else np.inf
             confounders = [
                 (other_effect, float(correlation))
@@ -353,13 +359,13 @@ class _IdentifiabilityAssessment:
                 if other_effect != name and other.norm > 0
             ]
             label = name
-            # An effect with several coefficients is named together with the coefficient.
+            # Of an effect with several coefficients, the name of the coefficient is added.
             if sum(effect == name for effect, _ in most_sensitive) > 1:
                 label += f" {parameter.name.rpartition('.')[2]}"
             identifiability = _classify_parameter(label, False, parameter, half_width, confounders)
             if probe.is_single_size:
-                # The effect of a limit or backlash is not proportional to it; it shows if it is
-                # reached.
+                # The response to a limit or backlash is not proportional to its size, so it has no
+                # interval (NaN). It is rated by the response at the tried sizes.
                 identifiability = replace(
                     identifiability, half=np.nan, word=_rate_switching_effect(norm)
                 )
@@ -388,6 +394,7 @@ class _IdentifiabilityAssessment:
         switching_effects = {probe.effect for probe in candidates if probe.is_single_size}
         basis, _ = np.linalg.qr(self.parameters)
         most_sensitive: dict[tuple[str, int], _Direction] = {}
+        # All responses at once would need too much memory.
         for begin in range(0, len(indices), CANDIDATES_PER_BLOCK):
             block = indices[begin : begin + CANDIDATES_PER_BLOCK]
             # 1. Information on each direction.
@@ -406,10 +413,13 @@ class _IdentifiabilityAssessment:
 
 
 def _rate_switching_effect(norm: float) -> IdentifiabilityLevel:
-    """Return the level of a limit or backlash that changes all samples by a norm.
+    """Rate how well the data identify a limit or backlash, from the size of its response.
+
+    It is not identifiable if the noise hides the response; weak if the response is only a little
+    larger than the smallest detectable one.
 
     Args:
-        norm: norm of the change, in units of the noise.
+        norm: norm of the change of all samples by the effect, in units of the noise.
     """
     if norm < MIN_DETECTABLE_LIMIT_SIGMAS:
         return "not identifiable"

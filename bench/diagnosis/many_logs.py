@@ -183,7 +183,8 @@ def explain_batch(
         return results
 
     remaining = [log for log in logs if log.name not in results_by_log]
-    # A worker process does not know the figure settings of this process.
+    # A worker process does not know the settings of this process, so the call states whether
+    # figures are written as PDF, too.
     calls = [(explain_log, (log, dict(settings), is_pdf_wanted())) for log in remaining]
     for index, result in pool.iterate_results(calls, np.inf):
         log = remaining[index]
@@ -298,6 +299,7 @@ def format_log_table(rows: Sequence[LogResult]) -> str:
                 estimate = [number[key] for key in ("value", "low", "high", "unit")]
                 cause_cells.append((cause["effect"], alternatives, coefficient, *estimate))
         common_cells = row.gap_closed, row.seconds, row.error
+        # Effect, alternatives, coefficient, value, low, high and unit.
         no_cause = ("",) * 7
         lines += [
             (row.log, row.verdict, *cells, *common_cells) for cells in cause_cells or [no_cause]
@@ -346,7 +348,11 @@ def list_common_causes(rows: Sequence[LogResult]) -> list[CommonCause]:
 
 
 def _format_ranges(numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Format the range of each coefficient over the logs, such as ``0.3 to 0.7 N``."""
+    """Format the range of each coefficient over the logs, such as ``0.3 to 0.7 N``.
+
+    Args:
+        numbers: Estimates of each coefficient by its name, one for each log, as in verdict.json.
+    """
     parts = []
     for name, estimates in numbers.items():
         values = [estimate["value"] for estimate in estimates]
@@ -443,6 +449,7 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
     }
     figures = {}
     for name, (panels, caption) in printed.items():
+        # A chart without panels has no figure.
         if panels:
             figure = draw_summary_figure(panels, charts.tables, caption)
             figures[name] = figure_output.render_all_formats(figure)
@@ -455,6 +462,7 @@ def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str
         table_file=LOGS_TABLE_FILE,
         verdicts=Counter(row.verdict for row in rows if row.verdict),
         causes=causes,
+        # Recordings with the most common cause.
         first_recordings=[batch.recordings[log] for cause in causes[:1] for log in cause.logs],
         closed=sorted(logs["gap_closed"][logs["causes"] != ""].dropna()),
         failed=[row for row in rows if row.error],
@@ -472,7 +480,9 @@ def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> p
     """Build a table with one row per log: its causes, its report and the share of the gap closed.
 
     `before` and `after` are the errors on held-out runs of the base and the extended model, as
-    multiples of the noise floor; they are NaN if a log was not explained.
+    multiples of the noise floor. `gap_closed` is the share of the gap between the first error and
+    the noise floor that the causes close, with its interval from `low` to `high`. All of them are
+    NaN if a log was not explained.
 
     Args:
         rows: Result of each log.

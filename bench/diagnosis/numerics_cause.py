@@ -84,7 +84,8 @@ def _compute_p_value(gain: float) -> float:
 def list_option_causes(finding: OptionFinding) -> list[Cause]:
     """Return the options of the solver that differ from the model file as causes.
 
-    The coefficient of an option that is a word is its MuJoCo number.
+    The coefficient of an option is its value in the simulation that explains the recording; an
+    option that is a word, such as a solver, has its number in MuJoCo.
 
     Args:
         finding: simulator class of the robot with the other options, and their gain.
@@ -107,7 +108,8 @@ def list_option_causes(finding: OptionFinding) -> list[Cause]:
 def list_step_causes(coarse: CoarseStepFinding) -> list[Cause]:
     """Return the integrator and the time step as causes if they differ from the model file.
 
-    An integrator has its MuJoCo number as coefficient; both are chosen, so they have no interval.
+    The coefficient of the integrator is its number in MuJoCo, that of the time step its value in s.
+    Both are chosen and not estimated, so they have no interval.
 
     Args:
         coarse: Finding that the file's step is too coarse.

@@ -31,7 +31,9 @@ OBJECTS = {"joint": "mjOBJ_JOINT", "body": "mjOBJ_BODY", "actuator": "mjOBJ_ACTU
 def render_mujoco_playground_code(
     ranges: RandomizationRanges, extended: ExtendedSimulator, robot: Any
 ) -> str:
-    """Return a Python file with a function `domain_randomize`.
+    """Return a Python file with a function `domain_randomize` for MuJoCo Playground.
+
+    The function sets each number of the compiled model to a random value of its range.
 
     Args:
         ranges: Ranges to write.
@@ -102,9 +104,11 @@ COLUMNS = (
 def build_range_files(
     ranges: RandomizationRanges, extended: ExtendedSimulator, folder: Path | None = None
 ) -> Mapping[str, str]:
-    """Return the content of each file by its name.
+    """Build the files with the ranges for domain randomisation, and return their contents by name.
 
-    Without ranges there are no files, and without model fields for the numbers there is no code.
+    They are a TOML file and a table of the ranges, and code for Isaac Lab and MuJoCo Playground.
+    Without ranges there are no files. There is no code if no number has a field in the compiled
+    model, because the code could not set it.
 
     Args:
         ranges: Ranges to write.

@@ -55,7 +55,9 @@ class Term(NamedTuple):
 def render_isaac_lab_code(
     ranges: RandomizationRanges, extended: ExtendedSimulator, robot: Any
 ) -> str:
-    """Return a Python file with a configclass of event terms.
+    """Return a Python file with a configuration class of event terms for Isaac Lab.
+
+    An event term is a call of an Isaac Lab function that randomises numbers of the robot.
 
     Args:
         ranges: Ranges to write.
@@ -154,7 +156,7 @@ def _make_body_terms(
         by_effect: ranges by effect and by body; those that are used are removed.
         sentences: comment for each range.
     """
-    # Mass and inertia have one coefficient, and so one range for each body.
+    # The effect on the mass has one coefficient, and so one range for each body.
     for name, (number_range,) in by_effect.pop("mass.scale", {}).items():
         params = {
             "mass_distribution_params": _format_pair(*_get_ends(number_range)),
@@ -175,6 +177,7 @@ def _make_body_terms(
         params = {"com_range": "{" + ", ".join(pairs) + "}"}
         notes = [sentences[number_range] for number_range in offsets]
         yield _build_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes)
+    # The inertia has one range for each body: a factor, while the range of a mass is a value in kg.
     for name, (number_range,) in by_effect.pop("inertia.scale", {}).items():
         params = {
             "inertia_distribution_params": _format_pair(number_range.minimum, number_range.maximum),
@@ -206,7 +209,7 @@ def _make_gain_terms(
     damping = by_effect.pop("actuator.damping", {})
     passive_damping = by_effect.pop("drag.linear", {})
     function = "randomize_actuator_gains"
-    # Stiffness.
+    # Stiffness. The interval of the joint is the sum of those of its actuators.
     for joint, actuators in _group_by_joint(robot, stiffness).items():
         gains = [
             _convert_gain_to_joint(robot, stiffness, name, STIFFNESS_COLUMN) for name in actuators
@@ -350,7 +353,7 @@ def _build_body_term(
         prefix: first part of the name of the term.
         body: name of the body.
         function: Isaac Lab function to call.
-        params: code of each further argument.
+        params: Python code of each further argument, by its name.
         notes: comments above the term.
     """
     return Term(

@@ -177,7 +177,7 @@ def list_randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> R
 
 
 def _find_missing_range_reason(number: FittedValue, entry: _Entry) -> str:
-    """Return why a number has no range; empty if it has one.
+    """Return in words why a number has no range for randomisation; empty if it has one.
 
     Args:
         number: fitted value of the coefficient.
@@ -216,16 +216,19 @@ class _Totals:
     def compute_total(
         self, cause_index: int, coefficient: str, value: float
     ) -> tuple[float | None, float, str]:
-        """Return a number of the model file as stated and with a changed coefficient, and its unit.
+        """Compute a number of the model file for a given value of one coefficient.
 
-        The second value has all other effects applied. The ends of an interval of a coefficient are
-        converted to those of the number in this way. If the file has no such number, there is no
-        first value (None), and the second one is the coefficient itself.
+        All other coefficients have their fitted values. The ends of the interval of a coefficient
+        are converted to those of the number in this way.
 
         Args:
             cause_index: Index of the cause.
             coefficient: Coefficient of the cause that is changed.
             value: Value of the coefficient.
+
+        Returns:
+            The number as the file states it, the number with all effects applied, and its unit. If
+            the file has no such number, they are None, the value of the coefficient, and its unit.
         """
         from sims.robot.export.model_file_totals import compute_file_totals
 

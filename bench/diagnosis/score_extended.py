@@ -132,6 +132,9 @@ def _compute_errors(
         engine: engine of the simulation; None for a simulator that steps itself.
         extended: extended simulator, with its parameters and coefficients.
         held_out: whether only held-out runs count.
+
+    Returns:
+        The runs with the squared errors (R, T, C) and the noise of each channel.
     """
     runs = recording.held_out() if held_out else recording.runs
     # Only the effects in the file are needed; the others are not part of the model.
@@ -289,6 +292,7 @@ def _summarise_errors(errors: _ScoredRuns) -> dict[str, Any]:
     Returns:
         The document of `score_model`: errors, numbers of runs and samples, and units.
     """
+    # Squared errors (R, T, C) of R runs, T samples and C channels; zero where nothing is recorded.
     evaluator, squares, sigma = errors
     observed_mask = np.isfinite(evaluator.observed)
     counts = observed_mask.sum(axis=(0, 1))
@@ -298,7 +302,7 @@ def _summarise_errors(errors: _ScoredRuns) -> dict[str, Any]:
         if counts[channel_index]:
             total = squares[:, :, channel_index].sum()
             rmse[name] = float(np.sqrt(total / counts[channel_index]))
-    # Errors of different channels can be added in units of their noise.
+    # Errors of channels with different units can be added in units of their noise.
     normalised_squares = squares / np.square(sigma)
     normalised = np.sqrt(normalised_squares.sum() / counts.sum())
     channels = evaluator.simulator.channels

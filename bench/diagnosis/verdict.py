@@ -194,7 +194,8 @@ class Verdict(Document):
         """Meaning of the verdict in one sentence.
 
         More special cases come first: a wrong unit or sign of the recording, then a coefficient of
-        a cause that is not a result, then a base parameter at a bound of its range.
+        a cause that is not a result, then a base parameter at a bound of its range. A search that
+        ended early (`cut`) has sentences of its own, and the second and third case do not count.
         """
         if self.recording_faults:
             return FAULTY
@@ -262,6 +263,9 @@ class InvalidVerdictError(InputError):
 
 def read_verdict(folder: Path) -> Verdict:
     """Read the verdict of an explanation.
+
+    Args:
+        folder: Folder to which the explanation was written.
 
     Raises:
         InvalidVerdictError: it is missing, or violates its JSON schema.

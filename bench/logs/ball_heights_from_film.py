@@ -180,8 +180,10 @@ def track_film(
         raise InputError(text if text.startswith(str(video)) else f"{video}: {text}") from None
 
     first, last = find_release_frame(track), int(track.visible_frames[-1])
+    # Frames of the recording: from the release to the last one that shows the ball.
     kept_frames = slice(first, last + 1)
     notes = [*film.notes, *track.notes, *heights.notes]
+    # The ball is visible earlier, but held by a hand.
     if first > track.visible_frames[0]:
         until = f"the ball is held until {track.times[first]:.2f} s"
         notes.append(f"{until}; earlier frames are left out")
@@ -296,6 +298,7 @@ def compute_heights_by_scale(
     else:
         factor = radius = diameter / 2
         method = "scaled by the ball's diameter, for a horizontal camera"
+        # Relative difference of the two scales.
         difference = 0.0 if factor_by_fall is None else factor_by_fall / factor - 1
         if abs(difference) > _REPORTED_SCALE_DIFFERENCE:
             notes.append(
@@ -324,6 +327,7 @@ def _compute_fall_position(track: BallTrack) -> Array:
     # The line of the fall is the first principal axis of the points; v counts downwards.
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
     axis = axes[0] if axes[0][1] >= 0 else -axes[0]
+    # The axis has length one, so 0.5 is the sine of 30 degrees.
     if axis[1] < 0.5:
         raise InputError(
             "the ball moves across the picture rather than down; expected a drop filmed upright"
@@ -491,7 +495,8 @@ def _estimate_sample_noise(track: BallTrack, heights: BallHeights, part: slice) 
     )
     if noise > 0:
         return noise
-    # A few frames give neither estimate: use the noise in pixels, scaled by the median radius.
+    # A few frames give neither estimate: use the noise in pixels. The ratio of the radius in metres
+    # to the median radius in pixels converts it.
     return track.noise * heights.radius / float(np.nanmedian(track.radius))
 
 

@@ -77,7 +77,8 @@ def write_film(
     camera, appearance = PinholeCamera.draw_published(rng, pixels), SceneAppearance.draw(rng)
     scene = BallScene(camera, appearance, radius, rng)
     filmed = FilmDescription(camera, radius, float(positions[0, 0]), float(positions[0, 1]))
-    # The camera is published with the film, so that exact heights follow from the images.
+    # The camera is published with the film, so that exact heights follow from the images. `crf` is
+    # the constant rate factor of the video encoder, which determines the quality of the images.
     description = {get_camera_file_path(out): format_camera_file(filmed)}
     write_video(out, scene.render_frames(positions), chosen_run.times, appearance.crf, description)
     return len(positions), float(chosen_run.times[-1] - chosen_run.times[0])

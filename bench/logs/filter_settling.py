@@ -32,10 +32,10 @@ The remaining share exp(-10) is less than the accuracy of a simulation.
 def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
     """Leave out the first samples of runs whose first activations (filter outputs) are not known.
 
-    A filter before an actuator depends on commands before the run; after a few time constants this
-    is forgotten. A run keeps all of its samples if its filters take more than half of it to settle,
-    or if the robot has floating bodies, whose later poses are not recorded; its filters then begin
-    at the first commands.
+    The output of a filter before an actuator depends on commands before the run, but after a few
+    time constants this influence is negligible (the filter has settled). A run keeps all of its
+    samples if its filters take more than half of it to settle, or if the robot has floating bodies,
+    whose later poses are not recorded; its filters then begin at the first commands.
 
     Args:
         recording: Recording as it was read.
@@ -47,7 +47,7 @@ def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Rec
     if not kind.has_model:
         return recording, ""
     robot: Any = kind
-    # Required states are those of floating bodies; activations are the outputs of filters.
+    # Nothing to do for floating bodies, which have required initial states, or without filters.
     if robot.system.required_state_units or not robot.system.activations:
         return recording, ""
     from sims.robot.dynamics.activation_filters import activation_filters

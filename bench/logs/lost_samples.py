@@ -116,7 +116,7 @@ def _insert_samples(run: Run, counts: NDArray[np.intp]) -> Run:
         return Akima1DInterpolator(run.times, values, method="makima")
 
     def insert(signals: Mapping[str, Any], values: Callable[[Any], Any]) -> dict[str, Any]:
-        """Insert the values that a function gives for each signal."""
+        """Insert new samples into each signal; `values` computes them from the old signal."""
         return {name: np.insert(old, indices, values(old)) for name, old in signals.items()}
 
     return replace(

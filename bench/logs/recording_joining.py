@@ -86,7 +86,8 @@ def _join_recordings(recordings: Sequence[Recording], kind: type[Simulator]) -> 
     default_values = {c.name: c.value for c in kind.constants}
     stated_keys = {key for recording in recordings for key in recording.constants}
     differing = stated_keys - common_constants.keys()
-    # A constant of a run is, in this order: its own, that of its recording, or the default.
+    # A constant of a run is the first of these: its own, that of its recording, or the default of
+    # the system. The later entry of the dict below takes precedence.
     runs = [
         replace(
             run,

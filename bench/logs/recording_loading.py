@@ -127,7 +127,8 @@ def read_frame_recording(
         InputError: The data frame or its description is malformed; the message is one line.
     """
     meta = dict(frame_description.description or {})
-    # A description states a system or a model file: the one that is given replaces the other.
+    # A description states either a system or a model file. One that the user gives replaces
+    # whatever the description states, also the other kind.
     if frame_description.system is not None:
         meta.pop("model", None)
         meta["system"] = frame_description.system

@@ -72,7 +72,13 @@ class SignalStatistics(NamedTuple):
 
 
 def compute_run_statistics(run: Run) -> RunStatistics:
-    """Count samples, gaps and missing values of a run, and measure its duration and intervals."""
+    """Count samples, gaps and missing values of a run, and measure its duration and intervals.
+
+    Durations are in seconds; the rate in Hz follows from the median interval.
+
+    Args:
+        run: Run with its sample times and channels.
+    """
     intervals = np.diff(run.times)
     median = float(np.median(intervals))
     return RunStatistics(
@@ -220,7 +226,11 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
 
 
 def _run_row(run: Run) -> tuple[str, ...]:
-    """Format the statistics of a run as a table row; sampling intervals are in milliseconds."""
+    """Format the statistics of a run as a table row; sampling intervals are in milliseconds.
+
+    Args:
+        run: Run with its channels, and whether it is fitted, held out or left out in turn.
+    """
     statistics = compute_run_statistics(run)
     if run.fold is not None:  # cross-validation
         use = "left out in turn"
@@ -308,6 +318,7 @@ def _format_constant(recording: Recording, name: str, default: float, unit: str)
             for value, runs in runs_by_value.items()
         ]
         return f"{name} differs by run: {'; '.join(parts)}"
+    # All runs have the same value.
     value = next(iter(runs_by_value))
     is_stated = name in recording.constants or any(name in run.constants for run in recording.runs)
     note = "" if is_stated else " (the system's default; not stated)"

@@ -62,7 +62,7 @@ def thin_recording(recording: Recording, kind: type[Simulator]) -> tuple[Recordi
     )
     if not kind.has_model or rate <= MAX_UNCHANGED_RATE:
         return recording, ""
-    # The largest stride is tried first; None if every stride would lose motion.
+    # The stride is the number k. The largest one is tried first; None if each would lose motion.
     strides = range(round(rate / MIN_THINNED_RATE), 1, -1)
     stride = next((k for k in strides if _preserves_motion(recording, k)), None)
     if stride is None:
@@ -93,6 +93,7 @@ def _preserves_motion(recording: Recording, stride: int) -> bool:
         for values in run.channels.values():
             if np.isfinite(values).mean() < MIN_AVAILABLE_SHARE:
                 return False
+            # An error that is a tiny share of the range of the channel is allowed in any case.
             min_error = NEGLIGIBLE_ERROR_SHARE * float(np.ptp(values[np.isfinite(values)]))
             allowed_error = max(
                 MAX_ERROR_RATIO * _compute_interpolation_error(run.times, values, 2), min_error

@@ -87,6 +87,7 @@ def segment_recording(
     affordable_seconds = _compute_affordable_seconds(kind) if is_limited else np.inf
     segments: list[Run] = []
     notes = []
+    # The limit holds for the runs for fitting and for the held-out runs separately.
     for purpose, runs in (("fitting", recording.training()), ("measuring", recording.held_out())):
         total_seconds = sum(map(_compute_duration, runs))
         if total_seconds <= affordable_seconds and seconds is None:
@@ -117,8 +118,8 @@ def segment_recording(
 def _compute_affordable_seconds(kind: type[Simulator]) -> float:
     """Return the seconds of a robot's motion that cost `MAX_RECORDING_COST`.
 
-    The cost is the number of steps, times the evaluations of a step, times the number of joints
-    plus 3 (1).
+    The cost of a simulation is (number of steps) (evaluations per step) (number of joints + 3) (1);
+    the evaluations depend on the integrator.
 
     Args:
         kind: Simulator class of the robot.
@@ -153,6 +154,7 @@ def _cut_run(run: Run, seconds: float, max_length: float) -> list[Run]:
     length = min(max_length, seconds)
     # A segment needs a few samples, even if only little of a run may be kept.
     length = max(length, MIN_SEGMENT_INTERVALS * float(np.median(np.diff(run.times))))
+    # Number of segments, rounded to the nearest one.
     count = max(int(seconds / length + 0.5), 1)
     spacing = _compute_duration(run) / count
     length = min(length, spacing)

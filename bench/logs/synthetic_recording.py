@@ -325,6 +325,7 @@ class _RecordingSimulation:
         for (name, sigma), values in zip(self.noise.items(), observed.T, strict=True):
             rng = self._make_rng("noise", name, number)
             channels[name] = values + sigma * rng.standard_normal(values.size)
+        # The last `self.held_out` runs are held out.
         held_out = number > self.options.runs - self.held_out
         # The pose of a floating body is never estimated, so it need not be hidden.
         states = {**self.kind.states, **scenario.initial}

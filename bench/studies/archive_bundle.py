@@ -211,6 +211,9 @@ def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
 def _format_compare_command(folder: Path, name: str) -> str:
     """Build the command that repeats a comparison, or a suite's comparisons of some methods.
 
+    A suite is a versioned set of problems, which has a command of its own. Its tuners may be those
+    of plugin files, which are named by their paths in the archive.
+
     Args:
         folder: folder of the comparison, or of a suite's comparisons.
         name: name of the folder in the archive.
@@ -233,7 +236,9 @@ def _format_compare_command(folder: Path, name: str) -> str:
 def write_archive(
     archive: Path, name: str, files: Mapping[str, Path], metadata: Mapping[str, Any]
 ) -> None:
-    """Write an archive completely or not at all.
+    """Write a zip archive of files and their manifest, completely or not at all.
+
+    The manifest lists each file with its size and SHA-256, so that a changed file is detected.
 
     Args:
         archive: Path of a new file.
@@ -354,6 +359,7 @@ def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipIn
     ]
     if repeated_names:
         raise _make_refusal(archive, f"{repeated_names[0]!r} is in it twice")
+    # A small archive that unpacks to very much would fill the disk (a "zip bomb").
     total, size = sum(member.file_size for member in entries), archive.stat().st_size
     if total > MAX_UNPACKED_BYTES or (
         total > _MIN_BYTES_FOR_RATIO_CHECK and total > MAX_COMPRESSION_RATIO * size
@@ -415,8 +421,13 @@ def _find_top_folder(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
 def _read_manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any]:
     """Read and validate the manifest of an archive, the list of its files with their hashes.
 
-    `packed` is the opened archive, and `top` its only folder. The size is checked first, because an
-    archive of unknown origin could contain a manifest that fills the memory.
+    The size is checked first, because an archive of unknown origin could contain a manifest that
+    fills the memory.
+
+    Args:
+        archive: path of the archive, for messages.
+        packed: archive, open for reading.
+        top: name of its only top-level folder.
 
     Raises:
         InputError: the manifest is too large, or does not follow its schema.

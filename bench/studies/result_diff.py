@@ -150,6 +150,10 @@ def load_comparison_side(folder: Path, metric: str | None = None) -> ComparisonS
         folder: its folder.
         metric: error to compare; None for the deciding error of the comparison.
 
+    Returns:
+        Its stored runs, the error curves of the metric, and what identifies each target: its true
+        parameters and its start.
+
     Raises:
         InputError: the folder has no comparison, no runs, or no runs with the metric.
     """
@@ -161,6 +165,7 @@ def load_comparison_side(folder: Path, metric: str | None = None) -> ComparisonS
         raise InputError(f"{folder}: has no {name}, which the other comparison is ranked by")
     runs = stored.runs[stored.runs[name].notna()]
     curves = RunRowTable(runs, stored.statuses, stored.experiment.budget).build_curves(name)
+    # Before the first simulation (k = 0), the recommendation of a run is its start.
     columns = [c for c in runs if str(c).startswith(_TARGET_KEY_COLUMNS)]
     targets = stored.runs[stored.runs["k"] == 0].groupby("target")[columns].first()
     return ComparisonSide(folder, stored, curves, targets)
@@ -217,13 +222,18 @@ class ComparisonDiff:
         """Compare the errors of one tuner in one range after k simulations.
 
         On shared targets the test is Wilcoxon's signed-rank test, otherwise the Mann-Whitney test;
-        both use the logarithm of each target's mean error over seeds. ``ratio`` is the change of
-        the error of b relative to a, and infinite errors count as failures.
+        both use the logarithm of each target's mean error over seeds. Infinite errors count as
+        failures.
 
         Args:
             kind: range of the targets, such as ``wide``.
             tuner: label of the tuner.
             k: number of simulations.
+
+        Returns:
+            Row of the schema ``diff``. ``median_a`` and ``median_b`` are the median errors over
+            targets. ``ratio`` is the error of b divided by that of a: the median over shared
+            targets, or else the ratio of both medians. ``paired`` is True with shared targets.
         """
         # Errors by (target, seed).
         errors_a, errors_b = (side.index_errors(kind, tuner, k) for side in (self.a, self.b))
@@ -240,6 +250,7 @@ class ComparisonDiff:
             compute_log_errors(np.asarray(errors, dtype=np.float64)) for errors in target_means
         )
         if is_paired:
+            # In this order the ratio of errors is that of b over a.
             test = compare_pair(log_errors_b, log_errors_a)
             count, ratio, p_value = test.targets, test.ratio, test.p_value
         else:
@@ -286,7 +297,8 @@ class ComparisonDiff:
     def statuses(self) -> list[dict[str, Any]]:
         """Numbers of runs by tuner and status that differ between the comparisons.
 
-        A status is the way a run ended, such as finished, failed or timed out.
+        A status is the way a run ended, such as ``done`` or ``timeout``. There is one row for each
+        tuner and status, with the numbers of both comparisons under ``a`` and ``b``.
         """
         counts_a, counts_b = (
             Counter(zip(s.stored.statuses["tuner"], s.stored.statuses["status"], strict=True))
@@ -523,6 +535,9 @@ class ExplanationDiff:
     def causes(self) -> list[dict[str, Any]]:
         """All effects that either explanation names, with their roles in both.
 
+        A cause is an effect that explains the data; an alternative is one that the data do not
+        distinguish from it.
+
         Roles are those of `ExplanationSide.classify_effect`: a cause, an alternative of a cause, or
         neither.
         """
@@ -555,11 +570,11 @@ class ExplanationDiff:
             _collect_coefficients(self.a), _collect_coefficients(self.b)
         )
         parameters = _pair_coefficients(self.a.verdict.parameters, self.b.verdict.parameters)
-        # The rows of both lists, which are extended in place.
+        # The rows of both lists together; each row gets a further entry below.
         rows = [*coefficients, *parameters]
         corrected = correct_holm(np.array([_compute_normal_p_value(row) for row in rows]))
         for row, value in zip(rows, corrected, strict=True):
-            # Without a p-value, because a number is missing or uncertain, it is not known.
+            # A number without a p-value, because a side or an interval is missing, gets None.
             row["significant"] = bool(value < FAMILYWISE_ERROR_RATE) if np.isfinite(value) else None
         return coefficients, parameters
 
@@ -575,6 +590,7 @@ class ExplanationDiff:
         return has_other_verdict or has_other_numbers or has_other_causes
 
     def _list_cause_places(self) -> list[tuple[str, str]]:
+        """Return the role of each effect in both explanations; see `causes`."""
         return [(cause["in_a"], cause["in_b"]) for cause in self.causes]
 
     @property
@@ -597,13 +613,16 @@ class ExplanationDiff:
     def _compare_candidates(self) -> list[dict[str, Any]]:
         """Return the best candidates of either explanation, with score and rank in both.
 
-        A candidate that one of the explanations does not rank has None as its score and rank there.
+        Candidates are the effects that were tested as causes, ranked by their score (the gain of
+        log-likelihood by the effect alone). One that an explanation does not rank has None as its
+        score and rank there.
         """
         # Rank and score of each candidate by its effect, for both explanations.
         ranked = [
             {c.effect: (rank, c.score) for rank, c in enumerate(side.verdict.candidates, 1)}
             for side in (self.a, self.b)
         ]
+        # Those among the best of at least one explanation.
         names = [
             effect
             for side in ranked
@@ -753,8 +772,14 @@ def find_changes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, A
 def _flatten_table(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values of nested tables, each with its path such as ``noise.q``.
 
-    `prefix` is the path of the table with its final dot. A tuple becomes a list, so that it equals
-    the list read from a file.
+    A tuple becomes a list, so that it equals the list read from a file.
+
+    Args:
+        value: tables that may contain tables.
+        prefix: path of `value` with its final dot, such as ``noise.``; empty for the outermost one.
+
+    Yields:
+        Path and value.
     """
     for key, item in value.items():
         if isinstance(item, Mapping):

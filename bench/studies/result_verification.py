@@ -320,6 +320,7 @@ def verify_comparison(
         raise InputError(f"{folder}: not finished, so its salt is not revealed; resume it first")
     if experiment.shot:
         raise InputError(f"{folder}: expected a comparison, found a bounce shot")
+    # A study with the table [calibration] contains two comparisons, in subfolders.
     if experiment.calibration:
         remedy = f"name one of the two in it: {folder / 'plain'} or {folder / 'extended'}"
         raise InputError(f"{folder}: expected a comparison, found a study of two; {remedy}")
@@ -483,6 +484,9 @@ def _convert_to_unit_cube(problem: TuningProblem, frame: pd.DataFrame) -> Array:
     Args:
         problem: the problem, with the bounds of its parameters.
         frame: one row for each point, one column for each parameter in physical units.
+
+    Returns:
+        (n, dim) points.
     """
     points: Array = np.clip(problem.cube.to_unit_cube(frame.to_numpy(dtype=float)), 0.0, 1.0)
     return points
@@ -536,7 +540,8 @@ def _verify_tables(
 ) -> list[VerificationFailure]:
     """Verify that table.csv follows from the rows, and return the failures.
 
-    The table is computed again and compared column by column; numbers may differ by rounding.
+    The table is computed again and compared column by column; numbers may differ by rounding. Of
+    each column the first wrong row is reported. Without the file there is nothing to verify.
 
     Args:
         folder: folder of the comparison.
@@ -615,14 +620,18 @@ class ExplanationVerification(NamedTuple):
 def verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVerification:
     """Check that the verdict and the extended model of an explanation agree.
 
-    The verdict must follow its schema, the extended model must load and have the same values, and
-    its errors on the recording are computed again if the recording is there. A failed check is a
-    doubt; a check that is not possible here, for example without the robot's model file, is listed
-    as unchecked.
+    The verdict states the causes that were found, with their fitted numbers; the extended model is
+    the simulator to which effects for these causes were added. The verdict must follow its schema,
+    the extended model must load and have the same values, and its errors on the recording are
+    computed again if the recording is there. A failed check is a doubt; a check that is not
+    possible here, for example without the robot's model file, is listed as unchecked.
 
     Args:
         folder: folder of the explanation.
         print_line: prints one line of text.
+
+    Returns:
+        Checks that were made, those that were not possible, and failures.
     """
     verification = ExplanationVerification([], [], [])
 
@@ -639,6 +648,7 @@ def verify_extended_model(folder: Path, print_line: PrintLine) -> ExplanationVer
         return verification
     note(f"{VERDICT_FILE}: valid for the JSON schema verdict: {verdict.verdict}")
     try:
+        # The two simulator classes that are returned as well are not needed.
         extended, _, _ = open_extended(folder / EXTENDED_MODEL_FILE, simulators.get)
     except InputError as error:
         text = str(error).replace(f"{folder}/", "")
@@ -715,6 +725,7 @@ def _score_extended_model(
         note: prints one line of text.
     """
     environment = read_environment(folder)
+    # RMS error of the extended simulator on the held-out runs.
     stated_error = verdict.heldout.rmse_extended if verdict.heldout else None
     tables = sorted((folder / RECORDINGS_FOLDER).glob("*.csv"))
     if stated_error is None:

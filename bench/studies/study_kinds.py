@@ -68,6 +68,7 @@ def begin_studies(
         for part in experiments:
             studies.append(begin(part, parent / part.name))
     except BaseException:
+        # Folders that were created before the error are deleted.
         for study in studies:
             study.close()
             shutil.rmtree(study.folder, ignore_errors=True)
@@ -88,8 +89,8 @@ def list_study_folders(folder: Path) -> list[Path]:
 def report_jointly(folder: Path, print_line: PrintLine) -> None:
     """Write and print the joint results of the studies in a folder, if their kind has any.
 
-    Several misspecification studies (with a table [calibration]), and the problems of a suite, have
-    joint results.
+    Several misspecification studies (with a table [calibration], on the effect of physics that the
+    simulator lacks), and the problems of a suite (a versioned set of problems), have joint results.
 
     Args:
         folder: folder that was given to `begin_studies`.

@@ -42,6 +42,8 @@ def compute_yaw_pitch_roll(quaternions: Array, reference: Array) -> Array:
 def unwrap_angle(positions: Array, command: Array | None = None) -> Array:
     """Restore the whole turns of an angle that was recorded within one turn; NaN stays NaN.
 
+    Shapes: T samples.
+
     Jumps of more than half a turn between samples are removed. The first sample may still be off by
     whole turns; with a command, the position is moved to the turn of the command.
 

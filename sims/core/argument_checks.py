@@ -286,7 +286,7 @@ def _convert_to_type(value: Any, hint: Any, arguments: tuple[Any, ...]) -> Any:
     """
     if hint is NoneType:
         return None if value is None else _NO_MATCH
-    if get_origin(hint) is type:
+    if get_origin(hint) is type:  # a subclass of the class in brackets
         return value if inspect.isclass(value) and issubclass(value, arguments[0]) else _NO_MATCH
     if hint is bool:
         is_bool = isinstance(value, bool | np.bool_) or (isinstance(value, int) and value in (0, 1))

@@ -233,6 +233,7 @@ class Effect(metaclass=EffectType):
         has_gravity = any(c.name == "gravity" for c in system.constants)
         defines_push = system_class.push is not System.push
         has_three_coordinates = len(system.coordinates) == 3
+        # For each property that an effect may need, why the system lacks it; empty if it has it.
         reason = {
             "": "",
             "input": "" if system.inputs else "it has no input",

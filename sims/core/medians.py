@@ -32,5 +32,6 @@ def compute_nan_median(values: NDArray[np.float32]) -> NDArray[np.float32]:
     count = np.isfinite(values).sum(axis=0, keepdims=True)
     lower_middle = np.take_along_axis(sorted_values, (count - 1) // 2, axis=0)
     upper_middle = np.take_along_axis(sorted_values, count // 2, axis=0)
+    # Both have a first axis of length one.
     result: NDArray[np.float32] = (lower_middle[0] + upper_middle[0]) / 2
     return result

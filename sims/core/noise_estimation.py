@@ -46,6 +46,8 @@ class NoiseEstimate(NamedTuple):
 def estimate_noise(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
     """Estimate white noise of a signal from its second and third differences.
 
+    Shapes: T samples.
+
     The differences are the residuals of samples against a line or parabola through their neighbours
     (von Neumann et al., Ann. Math. Stat. 12, 153, 1941, doi:10.1214/aoms/1177731746). They are made
     robust by their median, and generalised to non-uniform sampling by divided differences
@@ -75,6 +77,8 @@ def estimate_noise(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
 def estimate_differences_sigma(signals: Iterable[tuple[Array, Array]], order: int) -> float:
     """Estimate white noise (1 sigma) from divided differences of one order, over all runs.
 
+    Shapes: T samples.
+
     A difference of order n is the residual of a sample against a polynomial of degree n - 1 through
     n neighbours. The higher the order, the less a smooth motion contributes.
 
@@ -96,6 +100,8 @@ def estimate_differences_sigma(signals: Iterable[tuple[Array, Array]], order: in
 
 def _compute_divided_differences(times: Array, values: Array, order: int) -> Array:
     """Compute divided differences of samples: smooth motion cancels, noise stays.
+
+    Shapes: T samples.
 
     With windows of order + 1 samples y_i at the times t_i, they are d = sum_i w_i y_i with
     w_i ~ 1 / prod_(j != i) (t_i - t_j), scaled by sum_i w_i^2 = 1 so that white noise keeps its
@@ -120,6 +126,8 @@ def _compute_divided_differences(times: Array, values: Array, order: int) -> Arr
 
 def estimate_roughness(values: Array) -> float:
     """Estimate the noise of a signal from the residuals of local cubic fits.
+
+    Shapes: T samples.
 
     A cubic is fitted to each window of `NOISE_WINDOW_SAMPLES` samples in which the signal moves.
     Windows with gaps are skipped, and the median makes the result insensitive to bounces.

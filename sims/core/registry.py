@@ -61,6 +61,9 @@ class Registry(Generic[T]):
     def __init__(self, kind: str, group: str, base: type[T]) -> None:
         """Start without parts; installed parts are imported on first request.
 
+        Parts are stored by name: `_added` has the classes registered in this process, `_stubs` the
+        placeholders of plugins, and `_imported` the parts of installed packages that were loaded.
+
         Args:
             kind: Word for such a part in messages, e.g. ``tuner``.
             group: Entry-point group of the installed parts.
@@ -83,8 +86,9 @@ class Registry(Generic[T]):
     def get(self, name: str) -> type[T]:
         """Return the class registered as `name`.
 
-        It was registered in this process, by a stub for a plugin that is not imported here, or by
-        an installed package, which is imported now, at its first use.
+        The first of these is returned: a class registered in this process; the stub of a plugin,
+        which has its declared attributes but no code; the part of an installed package, which is
+        imported at its first use.
 
         Raises:
             InputError: The name is unknown.

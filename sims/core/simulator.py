@@ -86,6 +86,7 @@ def similar(name: str, known_names: Iterable[str]) -> str:
     # Ignore case and accept prefixes: users write Pendulum for pendulum, or a family for a member.
     names = {known_name.lower(): known_name for known_name in known_names}
     lower_name = name.lower()[:MAX_QUOTED_NAME_LENGTH]
+    # Fewer than three letters begin too many names.
     matches = [key for key in names if len(lower_name) >= 3 and key.startswith(lower_name)]
     matches = matches or get_close_matches(lower_name, names, cutoff=_MIN_NAME_SIMILARITY)
     similar_names = [names[key] for key in matches[:3]]
@@ -255,6 +256,7 @@ class Scenario:
         histories = {
             name: make_read_only(signal) for name, signal in self.before.items() if signal.size
         }
+        # A history (2, K) has times relative to the start of the run, and values.
         for name, (stamps, _) in histories.items():
             if not (np.diff(stamps, append=0.0) > 0).all():
                 raise InputError(
@@ -379,6 +381,7 @@ class Simulator(ABC):
             InputError: a constant is unknown, not finite, or outside its limits.
         """
         values = self._check_values("constant", defaults, given_values)
+        # `wanted` states in words what a constant must be.
         for constant in self.constants:
             value = values[constant.name]
             if constant.positive and value <= 0:

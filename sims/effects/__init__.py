@@ -26,9 +26,8 @@ def list_effects_for(system: type[System]) -> dict[str, type[Effect]]:
     for name in registry.names():
         try:
             effect = registry.get(name)
-        except (
-            PartUnavailableError
-        ):  # the list of effects shows the reason; explain works without it
+        except PartUnavailableError:
+            # Its package is missing; the list of effects shows this reason.
             continue
         for placed_effect in system.placed(effect):
             usable[placed_effect.name] = placed_effect

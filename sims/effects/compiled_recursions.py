@@ -95,6 +95,7 @@ def move_with_limited_acceleration(commands: Any, steps: Any, start: Any, means:
         deviation = commands[k] - position
         # Speeds towards the command are positive.
         direction = np.copysign(1.0, deviation)
+        # In the equations: d is `distance`, v `old_speed`, w `new_speed`, c `limit`, p `position`.
         distance, old_speed = abs(deviation), direction * speed
         step_distance = h * old_speed
         # Solution of d - h (v + w) / 2 = w h / 2.

@@ -90,7 +90,7 @@ class Wind(Force):
 
         Args:
             c: (3, L, 1) coefficients: drag, and wind speed along x and along y, m/s.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements with D coordinates.
         """
         return -c[0] * _compute_signed_square(moment.v - _compute_air_velocity(c, moment))  # (3)
 

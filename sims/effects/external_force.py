@@ -83,7 +83,8 @@ class ForceRipple(Force):
 
         Args:
             c: (3, L, 1) coefficients: a, b and the period in m or rad.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements with D coordinates; `along_primary` turns a
+                force (L, 1) on the primary coordinate into one (L, D) on all.
         """
         cycles = moment.primary / np.maximum(c[2], _MIN_PERIOD)
         return moment.along_primary(_compute_wave(c, cycles))  # (2)
@@ -109,7 +110,8 @@ class PeriodicForce(Force):
 
         Args:
             c: (3, L, 1) coefficients: a, b and the frequency in Hz.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements with D coordinates; `along_primary` turns a
+                force (L, 1) on the primary coordinate into one (L, D) on all.
         """
         return moment.along_primary(_compute_wave(c, moment.t * c[2]))  # (3)
 
@@ -171,7 +173,8 @@ class CubicSpring(Force):
 
         Args:
             c: (1, L, 1) cubic stiffness c.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `along_primary` turns a force (L, 1) on the
+                primary coordinate into one (L, D) on all.
         """
         x = moment.primary
         return moment.along_primary(-c[0] * x * x * x)  # (2); a power would be slower

@@ -171,7 +171,8 @@ class DirectionalLoadFriction(Friction):
 
         Args:
             c: (2, L, 1) coefficients: motor and external.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `sides` are the drive force and the passive
+                force of the joint, each (L, 1).
         """
         drive, passive = moment.sides  # the passive force is minus the external load
         return np.abs(np.maximum(c[0], 0.0) * drive + np.maximum(c[1], 0.0) * passive)  # (4)
@@ -194,7 +195,8 @@ class QuadraticLoadFriction(Friction):
 
         Args:
             c: (2, L, 1) coefficients: c and quadratic.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `sides` are the drive force and the passive
+                force of the joint, each (L, 1).
         """
         through = _limit_to_opposing(*moment.sides)
         return np.maximum(c[0] * moment.load + c[1] * through**2, 0.0)  # (5)
@@ -340,7 +342,8 @@ class FrictionHysteresis(HiddenStateEffect):
 
         Args:
             c: (2, L, 1) coefficients: limit F and deflection d.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `along_primary` turns a force (L, 1) on the
+                primary coordinate into one (L, D) on all.
             state: hidden state; its `v` is w.
         """
         ratio = moment.v[:, :1] / np.maximum(c[1], _MIN_DEFLECTION)

@@ -80,7 +80,8 @@ class ServoDeadBand(Force):
 
         Args:
             c: (1, L, 1) half width c of the dead zone.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `error` (L, 1) is e, and `aimed` returns the
+                change of the drive's force (L, D) by a shift (L, 1) of the set point.
         """
         width = np.maximum(c[0], 0.0)
         return moment.aimed(-np.clip(moment.error, -width, width))  # (1)
@@ -136,7 +137,8 @@ class ServoMotionProfile(Input):
 
         Args:
             c: (1, L, 1) limit c of the acceleration; none if not above zero.
-            signal: signal (L, S) over the steps.
+            signal: `values` (L, S) over the steps; `start` (L, 1) is its value before the first
+                step.
         """
         limit = np.maximum(c[0], 0.0)
         start = np.column_stack([signal.start[:, 0], limit[:, 0]])
@@ -147,9 +149,9 @@ class ServoMotionProfile(Input):
 def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
     """Return means (L, S) over each step of the signal `delay` (L, 1) seconds earlier.
 
-    Before the run, the signal has its initial value. A mean is the difference of the signal's
-    integral at both ends of the delayed step, divided by the step. Values remain unchanged where
-    the delay is not above zero, and in steps without length.
+    Before the first step, the signal has its initial value. A mean is the difference of the
+    integral of the signal at both ends of the delayed step, divided by the step. Values remain
+    unchanged where the delay is not above zero, and in steps without length.
 
     Shapes: L batch elements, S steps.
 
@@ -162,7 +164,8 @@ def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
     cumulative_integral = np.cumsum(signal.values * signal.steps, axis=1)
     averages = signal.values.copy()
     for batch_index in np.flatnonzero(delay[:, 0] > 0):
-        # The integral is linear between the ends of steps. It begins 1 s before the run, from where
+        # The integral is linear between the ends of steps, and zero where the first step starts. It
+        # begins 1 s before that with minus the initial value, as the signal is constant there;
         # `_integrate_signal` extends it to earlier times.
         knots = np.concatenate(
             [
@@ -210,15 +213,17 @@ class SupplySag(Force):
     def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), opposite to the drive.
 
-        With the forces U_i of all drives that share the supply and D = sum |U_i|, the lost force is
-        U_i c D / (1 + c D) (2).
+        With the forces U_i of all drives that share the supply, and drawn = sum |U_i|, the lost
+        force of a drive is U_i c drawn / (1 + c drawn) (2); for a single drive, this is (1).
 
         Args:
             c: (1, L, 1) share c of the voltage lost per unit of force.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements with D coordinates; `along_primary` turns a
+                force (L, 1) on the primary coordinate into one (L, D) on all, `sides` are the drive
+                force U_i and the passive force of the joint, each (L, 1).
         """
         drive, _ = moment.sides
-        relative_drop = np.maximum(c[0], 0.0) * moment.drawn  # c D
+        relative_drop = np.maximum(c[0], 0.0) * moment.drawn  # c drawn
         return moment.along_primary(-drive * relative_drop / (1.0 + relative_drop))  # (1), (2)
 
 
@@ -242,7 +247,10 @@ class SupplyBrakingLoss(Force):
 
         Args:
             c: (1, L, 1) lost share c of a braking force.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `primary_rate` is the velocity v (L, 1) of
+                the coordinate on which the effect acts, `along_primary` turns a force (L, 1) on
+                that coordinate into one (L, D) on all, `sides` are the drive force U and the
+                passive force of the joint, each (L, 1).
         """
         drive, _ = moment.sides
         braking_force = np.where(drive * moment.primary_rate < 0.0, drive, 0.0)

@@ -101,7 +101,9 @@ class EndStop(Force):
 
         Args:
             c: (3, L, 1) coefficients: stiffness k, place p and loss a.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `primary` and `primary_rate` are position x
+                and velocity v (L, 1) of the coordinate on which the effect acts, `along_primary`
+                turns a force (L, 1) on that coordinate into one (L, D) on all.
         """
         side = np.sign(c[0])
         depth = np.maximum(side * (moment.primary - c[1]), 0.0)
@@ -209,7 +211,7 @@ def make_level_effects(effect: type[Level], system: type[System]) -> tuple[type[
     for channel in levels:
         body = {
             "name": f"{effect.name}@{channel.name}" if has_several_levels else effect.name,
-            "of": effect.name,
+            "of": effect.name,  # the registered effect of which this is a form
             "place": channel.name if has_several_levels else "",
             "coefficients": [
                 _convert_to_level_size(c, channel.unit, channel.scale) for c in effect.coefficients

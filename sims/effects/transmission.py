@@ -142,7 +142,8 @@ class DrivenLoad(HiddenStateEffect):
 
         Args:
             c: (K, L, 1) the K coefficients of the effect.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `primary` is the position (L, 1) of the
+                coordinate on which the effect acts.
         """
         deflection = self.compute_static_deflection(
             c, _compute_gravity_acceleration(moment, moment.primary)
@@ -160,14 +161,17 @@ class DrivenLoad(HiddenStateEffect):
 
         Args:
             c: (K, L, 1) coefficients.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `primary` is the position (L, 1) of the
+                coordinate on which the effect acts, `along_primary` turns a force (L, 1) on that
+                coordinate into one (L, D) on all.
             state: position and velocity of the load.
         """
         pull = self.compute_coupling_force(c, moment, state)  # T / (s M)
-        fall = _compute_gravity_acceleration(moment, moment.primary)
+        fall = _compute_gravity_acceleration(moment, moment.primary)  # W(x) / M
         # The system's own weight W includes that of the load, which is subtracted here.
         reaction_force = -self.behind(c) * moment.inertia * (pull + fall)  # (1)
-        load_acceleration = pull + _compute_gravity_acceleration(moment, state.x)  # (2)
+        # (2) divided by s M.
+        load_acceleration = pull + _compute_gravity_acceleration(moment, state.x)
         return moment.along_primary(reaction_force), load_acceleration
 
     def compute_static_deflection(self, c: Array, fall: Array) -> Array:
@@ -219,7 +223,8 @@ class JointFlexibility(DrivenLoad):
 
         Args:
             c: (3, L, 1) coefficients: share s, frequency w (rad/s) and damping ratio z.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `primary` is the position (L, 1) of the
+                coordinate on which the effect acts.
             state: position and velocity of the load.
         """
         damped = 2.0 * c[2] * (moment.v[:, :1] - state.v)
@@ -256,7 +261,8 @@ class JointBacklash(DrivenLoad):
 
         Args:
             c: (2, L, 1) coefficients: gap and share s.
-            moment: state snapshot of L batch elements.
+            moment: state snapshot of L batch elements; `primary` is the position (L, 1) of the
+                coordinate on which the effect acts.
             state: position and velocity of the load.
         """
         relative_position = moment.primary - state.x

@@ -38,6 +38,8 @@ class ScenarioGroups:
         """Expand rows (N, ...) of the distinct scenarios to rows (L, ...) of the batch elements.
 
         Equal rows that share memory are broadcast.
+
+        Shapes: N distinct scenarios, L batch elements.
         """
         # Rows that are the same memory have a stride of zero.
         if len(rows) == 1 or rows.strides[0] == 0:

@@ -60,19 +60,22 @@ def compute_applied_inputs(
     unless its history is known. Effects act on the first input; effects with memory begin at the
     start of the known history.
 
-    Shapes: L batch elements, S steps.
+    Shapes: L batch elements, S steps, K coefficients of an effect.
 
     Args:
-        plan: Time grid.
+        plan: Time grid: steps of each batch element and their ends.
         runs: Scenarios of the batch elements.
-        commands: Inputs of each distinct scenario.
-        acting: Input effects in the order in which the signal passes them.
+        commands: Commanded inputs of each distinct scenario by name, each (T,) at T samples.
+        acting: Input effects with their coefficients (K, L, 1), in the order in which the signal
+            passes them.
 
     Returns:
         Applied inputs (L, S) by name.
     """
+    # Effects whose coefficients are zero in all batch elements do nothing.
     effects = tuple((effect, c, is_active(c)) for effect, c in acting if c.any())
     starts, ends, steps = _step_begins(plan.ends), plan.ends, plan.steps
+    # All scenarios have the same inputs; effects act on the first of them.
     input_name, *other_names = commands[0]
     # Inputs without effects: their means over the steps.
     applied = {}
@@ -84,12 +87,12 @@ def compute_applied_inputs(
     largest_step = max(float(steps.max(initial=0.0)), MAX_LEAD_IN_STEP_SECONDS)
     lead_in = _build_lead_in_steps(runs, input_name, largest_step)
     _, lead_in_count = lead_in.steps.shape
-    if lead_in_count:
+    if lead_in_count:  # the steps before the run are put in front of those of the run
         starts, ends, steps = (
             np.hstack([lead_part[runs.scenario_index], run_part])
             for lead_part, run_part in zip(lead_in, (starts, ends, steps), strict=True)
         )
-    step_ends = ends
+    step_ends = ends  # `ends` is shifted below
     # Backwards from the plant to the command: from the times at which a value is applied, find the
     # times at which it was commanded.
     for effect, c, is_acting in reversed(effects):
@@ -99,7 +102,7 @@ def compute_applied_inputs(
             continue
         starts = np.where(is_acting, effect.times(c, starts), starts)
         ends = np.where(is_acting, effect.times(c, ends), ends)
-    # Forwards with the values. Rows that share their memory are equal.
+    # Forwards with the values. Rows that share their memory (stride zero) are equal.
     has_uniform_steps = plan.has_uniform_steps or ends.strides[0] == 0
     means = _average_command(runs, input_name, commands, starts, ends, has_uniform_steps)
     for effect, c, is_acting in effects:
@@ -124,6 +127,7 @@ def compute_applied_inputs(
     result = _apply_input_effects(
         effects, steps, step_ends, means, initial_values[runs.scenario_index, None]
     )
+    # The steps before the run only served the effects' memory.
     return {input_name: result[:, lead_in_count:], **applied}
 
 
@@ -157,11 +161,13 @@ def _build_lead_in_steps(runs: ScenarioGroups, name: str, largest: float) -> _Le
     if size == 1:
         no_steps = np.empty((len(event_times), 0))
         return _LeadInSteps(no_steps, no_steps, no_steps)
+    # Steps are divided from time zero on, so that times are counted from the first one.
     first = np.array([[times[0]] for times in event_times])
     steps, step_ends, _, _ = divide_intervals(
         np.stack([pad_with_last(times, size) for times in event_times]) - first, largest
     )
     step_ends = step_ends + first
+    # A step begins where the previous one ends.
     return _LeadInSteps(np.hstack([first, step_ends[:, :-1]]), step_ends, steps)
 
 
@@ -174,9 +180,10 @@ def _apply_input_effects(
 ) -> Array:
     """Pass the means of the command through the effects on the input, one after the other.
 
-    Steps of length zero only fill up rows of batch elements with fewer steps; they repeat the value
-    of the step before them. The first value passes through the effects, too, since it is what the
-    next effect has received before the first step.
+    `Input.feel` computes the values that leave an effect from those that enter it. Steps of length
+    zero only fill up rows of batch elements with fewer steps; they repeat the value of the step
+    before them. The first value passes through the effects, too, since it is what the next effect
+    has received before the first step.
 
     Shapes: L batch elements, S steps.
 
@@ -191,7 +198,9 @@ def _apply_input_effects(
     Returns:
         Applied values (L, S).
     """
+    # Rows that share their memory (stride zero) are equal, so that one is enough.
     distinct_steps = steps[:1] if steps.strides[0] == 0 else steps
+    # Index (L, S) of the step whose value holds in each step; None if no step has length zero.
     last_steps = None if (distinct_steps > 0).all() else _find_last_nonzero_step(steps)
     values = means.copy() if last_steps is None else np.take_along_axis(means, last_steps, axis=1)
     start = start.copy()
@@ -200,7 +209,7 @@ def _apply_input_effects(
         # An effect may be active in few of the batch elements; evaluate only these.
         elements = np.flatnonzero(is_acting)
         coefficients, begin = c[:, elements], start[elements]
-        zeros = np.zeros_like(begin)
+        zeros = np.zeros_like(begin)  # lengths and ends of one step before the run
         signal = Signal(values[elements], steps[elements], begin, ends[elements])
         result = effect.feel(coefficients, signal)
         if last_steps is not None:
@@ -262,11 +271,12 @@ def _average_command(
     """
     count = len(commands) if has_uniform_steps else len(starts)
     averages = np.empty((count, starts.shape[1]))
-    # Process all batch elements with the same scenario in one call.
+    # Process all batch elements with the same scenario in one call. Sorting brings them together,
+    # and the borders are where the next scenario begins.
     sorted_elements = np.argsort(runs.scenario_index, kind="stable")
     borders = np.flatnonzero(np.diff(runs.scenario_index[sorted_elements])) + 1
     for elements in np.split(sorted_elements, borders):
-        run = runs.scenario_index[elements[0]]
+        run = runs.scenario_index[elements[0]]  # the same for all of these elements
         scenario = runs.unique_scenarios[run]
         is_linear = (name in scenario.linear) != is_other_interpolation
         average_signal = _average_linear_signal if is_linear else _average_held_signal
@@ -284,6 +294,8 @@ def _average_command(
 def _average_held_signal(times: Array, values: Array, starts: Array, end: Array) -> Array:
     """Return the means of a held signal over intervals; its value where an interval has no length.
 
+    Shapes: T samples.
+
     The mean over (a, b) is (A(b) - A(a)) / (b - a) (1), with the integral A of the signal. The
     signal has its first value before the first sample, and its last value after the last one.
 
@@ -293,7 +305,7 @@ def _average_held_signal(times: Array, values: Array, starts: Array, end: Array)
         starts: Beginnings of the intervals, s, of any shape.
         end: Ends of the intervals, s, of the same shape.
     """
-    # Samples that hold at the beginning of each interval, and at its end.
+    # Indices of the samples that hold at the beginning of each interval, and just before its end.
     first = np.searchsorted(times, starts, side="right") - 1
     first = np.clip(first, 0, times.size - 1)
     value: Array = values[first]
@@ -315,6 +327,8 @@ def _average_held_signal(times: Array, values: Array, starts: Array, end: Array)
 
 def _average_linear_signal(times: Array, values: Array, starts: Array, end: Array) -> Array:
     """Return the means of a linearly interpolated signal over intervals.
+
+    Shapes: T samples.
 
     The signal is constant before the first and after the last sample.
 
@@ -345,6 +359,8 @@ def _average_linear_signal(times: Array, values: Array, starts: Array, end: Arra
 def _compute_linear_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
     """Return the integral A(t) (1) of a signal that is interpolated linearly between samples.
 
+    Shapes: T samples.
+
     The difference of A over a step, divided by its length, is the mean that the engine applies.
 
     Args:
@@ -361,6 +377,8 @@ def _compute_linear_integral(times: Array, values: Array, area: Array, t: Array)
 
 def _compute_held_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
     """Return the integral A(t) (1) of a signal that is held between samples.
+
+    Shapes: T samples.
 
     The difference of A over a step, divided by its length, is the mean that the engine applies.
 

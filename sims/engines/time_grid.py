@@ -91,6 +91,7 @@ def build_time_grid(
     Returns:
         The steps of each batch element, and the number of the stored state for each sample.
     """
+    # (N, T) sample times since the start of each of N distinct scenarios.
     samples = max(s.times.size for s in runs.unique_scenarios)
     instants = np.stack([pad_with_last(_sample_times(s), samples) for s in runs.unique_scenarios])
     shifting = [(e, c) for e, c in effects if c.any() and shifts_time(e)]
@@ -106,6 +107,7 @@ def build_time_grid(
             runs.expand_rows(rows),
             has_uniform_steps=True,
         )
+    # From here on, one row for each batch element, since effects differ between them.
     instants = instants[runs.scenario_index]
     for effect, c in shifting:
         if isinstance(effect, Sensor):
@@ -115,7 +117,7 @@ def build_time_grid(
     instants = np.maximum.accumulate(instants, axis=1)
     changes = _find_change_times(runs, commands, shifting)
     event_times = np.concatenate([instants, changes], axis=1)
-    event_times = np.clip(event_times, 0.0, instants[:, -1:])
+    event_times = np.clip(event_times, 0.0, instants[:, -1:])  # within the run
     order = np.argsort(event_times, axis=1, kind="stable")
     event_times = np.take_along_axis(event_times, order, axis=1)
     steps, step_ends, steps_per_sample, rows = divide_intervals(event_times, largest_step)
@@ -140,7 +142,7 @@ def _find_change_times(
         shifting: effects that shift time, with their coefficients.
     """
     columns = []
-    for index, name in enumerate(commands[0]):
+    for index, name in enumerate(commands[0]):  # all scenarios have the same inputs
         change_times = []
         for s, u in zip(runs.unique_scenarios, commands, strict=True):
             changed = np.diff(u[name]) != 0

@@ -45,6 +45,8 @@ class SignalSource(NamedTuple):
     def combine(self, read_column: Callable[[str], Array]) -> Array:
         """Return the weighted sum (T,) of the columns, in their unit.
 
+        Shapes: T rows.
+
         Args:
             read_column: Function that returns a column (T,) by name.
         """
@@ -126,13 +128,13 @@ def read_sources(
             continue
         if "file" in run_table:
             run_files[name] = check_text(path, f"runs.{name}.file", run_table["file"])
-            folders[name] = ""
+            folders[name] = ""  # the folder of the description, unless one is stated
         if "folder" in run_table:
             folders[name] = check_text(path, f"runs.{name}.folder", run_table["folder"])
     tables = (*columns.values(), *extra.values())
     has_columns = any({"file", "column"} & table.keys() for table in tables)
     # Tables in the format of simgap have neither files nor folders, nor another time than t in s.
-    has_files = (
+    is_other_format = (
         any("file" in table for table in tables)
         or bool(folders)
         or bool({"column", "unit", "rate"} & time.keys())
@@ -143,10 +145,10 @@ def read_sources(
         second=seconds_per_unit,
         offset=check_finite(path, "time.offset", time.get("offset", 0.0)),
         folders=folders,
-        stated=has_columns or has_files,
+        stated=has_columns or is_other_format,
         rate=rate,
         files=run_files,
-        is_renaming=has_columns and not has_files,
+        is_renaming=has_columns and not is_other_format,
         extra={
             name: _read_source(path, f"extra.{name}", table, name) for name, table in extra.items()
         },

@@ -33,6 +33,8 @@ def read_csv_fast(
 ) -> tuple[list[str], dict[str, Array]] | None:
     """Read the run names and the numeric columns of a CSV table with pyarrow.
 
+    Shapes: T rows.
+
     It gives up where cells are quoted, or a number is missing or not finite, so that the slow
     reader, which inspects each cell, can locate the error.
 
@@ -205,6 +207,8 @@ class RecordingTable:
     ) -> tuple[list[str], dict[str, Array]]:
         """Convert the rows below the header to run names and numeric columns (T,).
 
+        Shapes: T rows.
+
         Rows are converted in blocks, so that the texts of a long table are never all in memory.
 
         Args:
@@ -325,6 +329,8 @@ class RecordingTable:
     def _convert_to_numbers(self, name: str, cells: Sequence[str], first_row: int) -> Array:
         """Convert the cells of a column to numbers (T,); empty ones to NaN where gaps are allowed.
 
+        Shapes: T rows.
+
         Python's `float` converts all cells at once. Cells that it converts to something not finite,
         or that it accepts but an instrument would not write, are checked one by one.
 
@@ -429,6 +435,8 @@ class RecordingTable:
     def _check_seconds(self, t: Array, first: int, last: int) -> None:
         """Check that the stamps of a run can be seconds, and not a smaller unit.
 
+        Shapes: N rows.
+
         The latest stamp and the duration of the run must be plausible.
 
         Args:
@@ -448,6 +456,8 @@ class RecordingTable:
 
     def _check_times_increase(self, t: Array, edges: list[int]) -> None:
         """Check that the times increase within each run.
+
+        Shapes: T rows.
 
         Args:
             t: (T,) times of all rows, s.

@@ -45,6 +45,8 @@ class DriveSwitch(NamedTuple):
     def off(self, run: Run) -> Mask:
         """Return whether the drive is off at each sample (T,).
 
+        Shapes: T samples.
+
         A missing cell has the value of the previous one, and before the first value, that value. A
         column without any value never switches the drive off.
         """
@@ -203,6 +205,8 @@ def apply_drive_switches(
 
 def format_run_spans(runs: Sequence[Run], masks: Sequence[Mask]) -> str:
     """Format the time spans of each run in which a mask is set, for a message.
+
+    Shapes: T samples.
 
     Args:
         runs: Runs; at most `MAX_LISTED_RUNS` of those with a span are listed.

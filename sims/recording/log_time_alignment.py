@@ -39,7 +39,7 @@ def read_logs(
     The rows of a run are all times at which a channel or an input has a stamp, from the first to
     the last sample of a channel. The cells of a channel are empty between its own stamps, so that
     measurements are not resampled; an input has its held or interpolated value at all times, and an
-    extra column its held value.
+    extra column (neither channel nor input) its held value.
 
     Args:
         path: Table in which signals without a stated file are found.
@@ -153,7 +153,7 @@ class _FolderLogs:
         Raises:
             InputError: A log has missing or decreasing stamps, or a signal has no samples.
         """
-        rows_of, notes = self._select_rows(run_rows)
+        rows_of, notes = self._select_rows(run_rows)  # stamps and rows of each log, by path
         times = self._sample_times(run, rows_of)
         columns = {}
         for channel in self._channels:
@@ -163,6 +163,7 @@ class _FolderLogs:
                 raise InputError(f"{log.path}: column {channel} has no sample; leave it out")
             # Write the values into the rows of the table that have the stamps of the channel.
             stamps = rows_of[log.path].stamps
+            # Stamps before the first or after the last row of the run have no row.
             row_indices = np.searchsorted(times, stamps - SAME_INSTANT_SECONDS)
             is_in_run = (row_indices < times.size) & (stamps >= times[0] - SAME_INSTANT_SECONDS)
             column = np.full(times.size, np.nan)
@@ -205,6 +206,8 @@ class _FolderLogs:
     def _sample_times(self, run: str, rows_of: Mapping[Path, _LogRows]) -> Array:
         """Return the times (T,) of a run in seconds: all stamps of its channels and inputs.
 
+        Shapes: T times.
+
         Stamps of inputs before the first or after the last measurement are left out, and stamps
         that differ by rounding count as one.
 
@@ -231,6 +234,8 @@ class _FolderLogs:
 
     def _read_signal(self, signal: str, rows: _LogRows) -> Array:
         """Return the values (N,) of a signal in the rows of a run, in the unit of the log.
+
+        Shapes: N rows.
 
         A signal may be a weighted sum of several columns, for example of coupled drives.
 
@@ -264,6 +269,8 @@ class _FolderLogs:
     ) -> Array:
         """Return the values of an input or an extra column at all times of a run.
 
+        Shapes: T times.
+
         Its own stamps differ from these times, so its last value is held, or it is interpolated.
         Before its first stamp, it has its first value.
 
@@ -284,6 +291,7 @@ class _FolderLogs:
         values = self._read_signal(signal, rows)
         missing = np.flatnonzero(~np.isfinite(values))
         if missing.size and signal in self._inputs:
+            # `first` is the number of the first row of data in the file, for messages.
             row = int(rows.rows[missing[0]]) + log.first
             columns = ", ".join(self._sources[signal].columns)
             raise InputError(
@@ -292,12 +300,15 @@ class _FolderLogs:
             )
         if is_linear:
             return np.interp(times, rows.stamps, values)
+        # Index of the last sample up to each time; -1 before the first sample.
         last_rows = np.searchsorted(rows.stamps, times + SAME_INSTANT_SECONDS, side="right") - 1
         held_values: Array = values[np.maximum(last_rows, 0)]
         return held_values
 
     def _read_stamps(self, log: LogFile, run_rows: Mask | None) -> tuple[Array, Mask]:
         """Return the stamps (N,) of a log in its own unit, and a mask of those that are new.
+
+        Shapes: N rows.
 
         A stamp that repeats the previous one is not new. Few repeated stamps are tolerated, many
         mean that the column is not a clock. If the log has no stamps, they follow from the sampling
@@ -318,6 +329,7 @@ class _FolderLogs:
         stamps = stamps if run_rows is None else stamps[run_rows]
         location = f"{log.path}, column {self._time_column}"
         if not np.isfinite(stamps).all():
+            # `first` is the number of the first row of data in the file, for messages.
             row = int(np.flatnonzero(~np.isfinite(stamps))[0]) + log.first
             raise InputError(f"{location}, {log.rows} {row}: expected a stamp, found none")
         if np.abs(stamps).max() * self._seconds_per_unit > MAX_TIMESTAMP_SECONDS:
@@ -326,7 +338,7 @@ class _FolderLogs:
                 f"{stamps[0]:.12g}; is it milliseconds or less?"
             )
         steps = np.diff(stamps)
-        bad_steps = np.flatnonzero(steps < 0)
+        bad_steps = np.flatnonzero(steps < 0)  # index of the stamp before each decrease
         if not bad_steps.size and (steps == 0).sum() > MAX_REPEATED * stamps.size:
             bad_steps = np.flatnonzero(steps == 0)
         if bad_steps.size:

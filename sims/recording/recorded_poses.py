@@ -65,6 +65,8 @@ def convert_quaternions(
 ) -> dict[str, Array]:
     """Replace the quaternion of a floating body among the channels of a run by yaw, pitch and roll.
 
+    Shapes: T samples.
+
     In the simulation the body has three hinges in place of its quaternion, whose coordinates are
     these angles. Channels without a quaternion of the body are returned unchanged.
 

@@ -307,6 +307,7 @@ def _read_own_table(
 
     channel_columns = columns_of(channels)
     input_columns = [column for column in columns_of(inputs) if column not in channel_columns]
+    # An extra column is never a sum of several.
     extra_columns = {name: sources.extra[name].columns[0] for name in extra}
     renamed_runs = []
     for part in read_table(path, channel_columns, input_columns, list(extra_columns.values())):
@@ -324,7 +325,7 @@ def _make_run(table: Path, part: CsvRun, description: RecordingDescription) -> R
 
     Units are converted, quaternions become angles, and wrapped angles are unwrapped (their whole
     turns are restored). The initial pose of a floating body, which no channel shows, is the first
-    cell of an extra column, unless the description states it.
+    cell of an extra column (neither channel nor input), unless the description states it.
 
     Args:
         table: path of the table, for messages.

@@ -354,8 +354,8 @@ class _DescriptionReader:
     def read(self) -> RecordingDescription:
         """Read and check all tables.
 
-        They are checked in this order: channels, inputs, constants, runs, extra columns, and
-        columns that switch drives.
+        They are checked in this order: channels, inputs, constants, runs, extra columns (which are
+        neither channel nor input), and columns that switch drives.
 
         Raises:
             InputError: The description is malformed; the message is one line.
@@ -381,7 +381,7 @@ class _DescriptionReader:
             raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
         constants = self._read_constants("constants", meta.get("constants", {}))
         self._check_constants_possible("constants", constants)
-        # The names of the runs are checked after the table was read.
+        # Which runs exist is known only after the table was read; their names are checked then.
         runs = {
             name: self._read_run(name, table)
             for name, table in get_subtable(path, meta, "runs").items()
@@ -723,9 +723,15 @@ class _DescriptionReader:
         }
 
     def _check_constants_possible(self, key: str, constants: Mapping[str, float]) -> None:
-        """Check that constants are physically possible, such as a positive mass."""
+        """Check that constants are physically possible, such as a positive mass.
+
+        Args:
+            key: key of their table in the description, for messages.
+            constants: constants by name, SI units.
+        """
         for constant in self.declared.constants:
             value = constants.get(constant.name)
+            # `wanted` states in words what the constant must be; it is empty for a possible value.
             if value is not None and (expected := constant.wanted(value)):
                 raise InputError(
                     f"{self.path}: {key}.{constant.name}: expected {expected}, found {value:g}"

@@ -208,6 +208,7 @@ def _build_frame_description(
         else:
             raise _make_unassigned_column_error(path, name, declared)
 
+    # Attributes of a frame may hold anything; only a mapping of units is used.
     noted_units = frame.attrs.get("units", {})
     noted_units = noted_units if isinstance(noted_units, Mapping) else {}
     _state_unit(time, time_column, units, noted_units)
@@ -215,6 +216,7 @@ def _build_frame_description(
     missing = {}
     for name, table in (*channels.items(), *inputs.items(), *extra.items()):
         # Entries that are not tables are refused when the description is checked.
+        # The columns of a signal have one unit, which is looked up by the first of them.
         column = _list_signal_columns(name, table)[0]
         if isinstance(table, dict) and not _state_unit(table, column, units, noted_units):
             missing[column] = si_units.get(name, "1")
@@ -359,6 +361,8 @@ class _FrameTable(RecordingTable):
 
     def _get_values(self, name: str, frame: Any, column: str) -> Array:
         """Return a column as numbers (T,); NaN where a cell is missing.
+
+        Shapes: T rows.
 
         Absolute time stamps become seconds from the first one, and time differences seconds.
 

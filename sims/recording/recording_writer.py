@@ -102,6 +102,8 @@ def format_table(runs: Sequence[Run], digits: int) -> str:
 def _format_cells(values: Array, digits: int) -> list[str]:
     """Format a column of the table; a missing sample (NaN) becomes an empty cell.
 
+    Shapes: T samples.
+
     Args:
         values: (T,) numbers of the column, NaN where missing.
         digits: significant digits of each cell.

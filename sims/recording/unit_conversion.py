@@ -90,6 +90,8 @@ def compute_unit_scale(unit: str, target: str) -> UnitScale:
 def convert_values(values: Array, scale: UnitScale, subject: str) -> Array:
     """Convert values to another unit.
 
+    Shapes: T samples.
+
     Args:
         values: (T,) values, NaN where missing.
         scale: Conversion of their unit.

@@ -79,7 +79,7 @@ def find_pair_geoms(robot: RobotModel, pair: str) -> tuple[int, int]:
     """
     model = robot.compiled
     geom_ids = {get_geom_name(model, geom): geom for geom in range(model.ngeom)}
-    # The name of a geom may contain the separator.
+    # The name of a geom may contain the separator, so each way to divide `pair` into two is tried.
     parts = pair.split(PAIR_SEPARATOR)
     for count in range(1, len(parts)):
         names = (PAIR_SEPARATOR.join(part) for part in (parts[:count], parts[count:]))

@@ -44,8 +44,8 @@ def get_friction_solref(timestep: float, integrator: int) -> tuple[float, float]
 
     Friction pulls the velocity v to zero by the reference acceleration -b v. A step of Euler or of
     the implicit integrators stops the velocity completely with b = 1 / h, and overshoots beyond it.
-    The four evaluations of RK4 tolerate b = `MAX_RK4_FRICTION_RATE` / h, and 3 / h chatters. With
-    MuJoCo's default time constant of 0.02 s, a joint at rest creeps.
+    The four evaluations of RK4 tolerate b = `MAX_RK4_FRICTION_RATE` / h; with 3 / h the velocity
+    chatters. With MuJoCo's softer default, a time constant of 0.02 s, a joint at rest creeps.
 
     Args:
         timestep: time step h in seconds.
@@ -109,7 +109,8 @@ def get_friction_constraint(robot: RobotModel, dof: int) -> tuple[float, float]:
     # which the impedance is the largest one.
     limits = np.clip(solimp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     (at_rest, largest), width = limits.tolist(), float(solimp[2])
-    # Friction has no constraint violation. For a constant impedance, MuJoCo takes the mean.
+    # Friction has no constraint violation, so it has the impedance there. A width of zero means a
+    # constant impedance, for which MuJoCo takes the mean.
     d = at_rest if width > mujoco.mjMINVAL else 0.5 * (at_rest + largest)
     if timeconst <= 0:  # The numbers are -stiffness and -damping.
         return -second / largest, d

@@ -40,7 +40,7 @@ def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, Fitted
     Args:
         extended: extended simulator of a robot, with the fitted values.
     """
-    kind: Any = extended.kind
+    kind: Any = extended.kind  # simulator class of the robot
     causes: dict[str, Mapping[str, FittedValue]] = {}
     for effect in kind.system.freed_effects:
         names = [coefficient.name for coefficient in effect.coefficients]
@@ -53,6 +53,7 @@ def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, Fitted
             name: extended.parameters[parameter]
             for name, parameter in zip(names, parameters, strict=True)
         }
+    # Freed numbers, diagnosed effects, and options of the integrator.
     return {**causes, **extended.effects, **_list_numerics_causes(kind)}
 
 

@@ -166,8 +166,8 @@ class FloatingJoints:
     def displace(self, pose: Array, displacements: Array) -> Array:
         """Displace poses (n, P) by small displacements (n, F) in m and rad.
 
-        A pose has P numbers, positions and quaternions, and a displacement has F, as many as there
-        are velocities.
+        A pose has P numbers, positions and quaternions. A displacement has F numbers, one for each
+        velocity: a shift d_p (only of free joints) and a rotation d_r of each body.
 
         The position p of a body becomes p + d_p, along the axes of the world. Its orientation, the
         quaternion q, becomes q exp(d_r / 2) with the rotation vector d_r in the axes of the body
@@ -195,8 +195,8 @@ class FloatingJoints:
     def compute_displacement(self, pose: Array, reference: Array) -> Array:
         """Compute the displacements (n, F) from reference poses (n, P) to other poses (n, P).
 
-        A pose has P numbers, positions and quaternions, and a displacement has F, as many as there
-        are velocities.
+        A pose has P numbers, positions and quaternions. A displacement has F numbers, one for each
+        velocity.
 
         A displacement has the difference of positions in m, and the rotation vector of
         q_reference^-1 q in rad, so that `displace` moves the reference pose to the other one.

@@ -71,7 +71,7 @@ class IntegratorSettings(NamedTuple):
         }
 
     def replace_options(self, options: Mapping[str, float]) -> IntegratorSettings:
-        """Return the settings with other options.
+        """Return the settings with other values of some options; all others keep theirs.
 
         Args:
             options: numbers by name of the option, as in `to_model_options`.

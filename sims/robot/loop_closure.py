@@ -73,6 +73,7 @@ def close_loops(
     mujoco.mj_differentiatePos(model, change, 1.0, reference, data.qpos)
     change[dofs] = 0.0
     data.qpos[:] = reference
+    # Number of steps in which the measured joints move, each by at most `MAX_MOTION`.
     poses = 1 + int(np.abs(change).max(initial=0.0) / MAX_MOTION)
     jacobian: Array | None = None
     for _ in range(poses):
@@ -109,7 +110,8 @@ def settle_loops(
         return dict(states)
     loops = _LoopModel(robot, states, unmeasured)
     model, data = loops.model, loops.data
-    # Go back in time with constant velocities, and close the loops there.
+    # Go back in time with constant velocities, and close the loops there. A negative time step
+    # moves the positions backwards.
     steps = max(round(SETTLING_SECONDS / model.opt.timestep), 1)
     mujoco.mj_integratePos(model, data.qpos, data.qvel, -steps * model.opt.timestep)
     if _solve_constraints(loops) is None:
@@ -185,9 +187,11 @@ class _LoopModel:
             unmeasured: names of the unmeasured joints.
         """
         self.model, self.data = _make_dense_data(robot)
-        # Addresses of the unmeasured joints by the names of their positions and velocities.
+        # Addresses of the unmeasured joints in qpos and qvel, by the names of their positions and
+        # velocities.
         addresses: dict[str, int] = {}
         dofs: dict[str, int] = {}
+        # Lowest and highest value of each position; infinite for joints without a range.
         self.ranges = np.full((2, self.model.nq), [[-np.inf], [np.inf]])
         for joint in robot.joints:
             # The names of a joint's positions (and velocities) have consecutive addresses.
@@ -214,6 +218,7 @@ class _LoopModel:
         """
         import mujoco
 
+        # All degrees of freedom except for those of the unmeasured joints.
         guided = np.setdiff1d(np.arange(self.model.nv), self.dofs)
         self.model.dof_armature[guided] += GUIDED_INERTIA
         flags = mujoco.mjtDisableBit
@@ -398,7 +403,8 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
             coupled_dofs = [dof for body in chain for dof in _get_dofs(model, body)]
         else:
             continue
-        # Merge the group with all former ones that share a joint with it.
+        # Merge the group with all former ones that share a joint with it. Joints that are not in
+        # `dofs` are left out.
         group = {joint_of_dof[dof] for dof in coupled_dofs if dof in joint_of_dof}
         overlapping_groups = [other_group for other_group in groups if other_group & group]
         groups = [other_group for other_group in groups if not other_group & group]

@@ -159,7 +159,7 @@ def _make_finder(name: str, *index: int) -> Find:
 
 
 def _find_mass_centre_fields(robot: RobotModel, place: str) -> list[list[ModelField]]:
-    """Return the three fields of a body's centre of mass.
+    """Return the fields of a body's centre of mass: one for each of the coefficients x, y and z.
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -183,6 +183,7 @@ def _make_servo_gain_finder(term: int) -> Find:
     def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
         """Return the fields with the same gain of the actuator `place`: gain (if any), and bias."""
         actuator_id = robot.actuator(place).id
+        # The bias parameter is the negative gain (-1).
         servo_fields = [ModelField("actuator_biasprm", (actuator_id, term), -1)]
         if is_control_set_point(robot, actuator_id, term):
             servo_fields.insert(0, ModelField("actuator_gainprm", (actuator_id, 0)))
@@ -193,6 +194,8 @@ def _make_servo_gain_finder(term: int) -> Find:
 
 def _find_force_range_fields(robot: RobotModel, place: str) -> list[list[ModelField]]:
     """Return both ends of an actuator's force range, which one positive limit determines.
+
+    The upper end is the limit, and the lower end is the negative limit (sign -1).
 
     Args:
         robot: model of the robot: joints, bodies, actuators, and the compiled MuJoCo model.
@@ -220,6 +223,9 @@ def _make_adding_writer(find: Find) -> FieldWriter:
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         """Add coefficients c (K, L) to the fields of L batch elements, in place.
 
+        The function `find` gives the fields with the number of each coefficient; the first one is
+        changed.
+
         Args:
             fields: model fields by name.
             robot: robot of the batch.
@@ -243,7 +249,9 @@ def _make_scaling_writer(find: Find) -> FieldWriter:
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-        """Scale the fields of L batch elements in place by the coefficient c (1, L).
+        """Scale the fields of L batch elements in place by 1 + c, with the coefficient c (1, L).
+
+        The function `find` gives all fields that hold the number of this coefficient.
 
         Args:
             fields: model fields by name.
@@ -272,6 +280,9 @@ def _make_shifting_writer(find: Find) -> FieldWriter:
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
         """Add coefficients c (K, L) to the fields of L batch elements, in place.
+
+        The function `find` gives the fields with the number of each coefficient; the first one is
+        changed.
 
         Args:
             fields: model fields by name.
@@ -512,7 +523,10 @@ def _make_solref_writer(index: int) -> FieldWriter:
     """
 
     def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
-        """Scale the parameters of the pair of geoms `place`, by c (1, L) for L batch elements.
+        """Scale a parameter of the pair of geoms `place` by 1 + c, in each of L batch elements.
+
+        MuJoCo's `solref` is a time constant t and a damping ratio z (`index` 0 and 1), or the
+        negative stiffness k and damping b, which change with them.
 
         Args:
             fields: model fields by name.

@@ -234,6 +234,7 @@ class RobotModel:
 
         The joint is the floating one of the file, which slides and hinges of the body replace.
         """
+        # Any of the new joints leads to the body; a ball joint is replaced by hinges only.
         hinges = {base: self.joint(f"{base}.{ANGLES[0]}").id for base in self.recorded_bases}
         return {
             base: tuple(self.compiled.body(int(self.compiled.jnt_bodyid[hinge])).quat.tolist())
@@ -275,6 +276,7 @@ class RobotModel:
                     position=int(model.jnt_qposadr[joint_id]),
                     velocity=int(model.jnt_dofadr[joint_id]),
                     range=(low, high) if model.jnt_limited[joint_id] else None,
+                    # The upper limit of the actuator force.
                     effort=effort[1] if effort else None,
                 )
             )
@@ -516,7 +518,8 @@ def _detect_actuator_kind(model: Any, i: int) -> ActuatorKind:
     gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
     has_constant_gain = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
     has_affine_bias = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    # A first-order filter before the actuator changes when a control acts, but not its meaning.
+    # A first-order filter before the actuator changes when a control acts, but not its meaning;
+    # `filters` returns MuJoCo's numbers of the types of filters.
     dynamics = int(model.actuator_dyntype[i])
     keeps_meaning = dynamics == int(mujoco.mjtDyn.mjDYN_NONE) or dynamics in filters()
     pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # Available since MuJoCo 4.

@@ -114,6 +114,7 @@ class RobotSimulator(SystemSimulator):
         ]
         if repeated_names:
             raise InputError(f"effect {repeated_names[0]}: its coefficient is free already")
+        # Effects whose coefficients are the free numbers of the model file.
         freed_effects = self.system.freed_effects
         self._freed_effects: list[Effect] = [effect() for effect in freed_effects]
         self.robotic = self.system()
@@ -395,6 +396,11 @@ class RobotSimulator(SystemSimulator):
         Args:
             batch: batch elements of the run.
             steps: number of steps.
+
+        Returns:
+            For n batch elements and S steps: mean controls (n, S, nu), forces (n, S, nv), applied
+            inputs (n, S) by name, controls at the beginnings of the steps, initial activations
+            (n, na), and whether each of K actuators is off (n, S, K).
         """
         # 1. Applied inputs (n, S) by name.
         batch_size = len(batch.x)
@@ -411,7 +417,8 @@ class RobotSimulator(SystemSimulator):
         initial_inputs = (
             compute_inputs(SAME_INSTANT_SHARE) if self._records_drive_forces else applied_inputs
         )
-        # 2. Controls.
+        # 2. Controls: means over the steps, and values at their beginnings. Without recorded drive
+        # forces the latter are not used, and are the same array.
         model = self.robot.compiled
         controls = np.zeros((batch_size, steps, model.nu))
         instant_controls = np.zeros_like(controls) if self._records_drive_forces else controls
@@ -538,6 +545,11 @@ class RobotSimulator(SystemSimulator):
                 the model.
             inputs: controls, forces and activations over the steps.
             extra_fields: additional fields of MuJoCo's data to record.
+
+        Returns:
+            Positions and velocities (n, S + 1, D) of the D joints at the beginnings of S steps and
+            at the end, recorded fields (n, S, ...) by name, initial activations, which elements
+            have failed (n,), and the states of joints in series.
         """
         # 1. Batch. All elements need the same added elements, so that there is one group.
         batch_size = len(start.x)

@@ -353,11 +353,13 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
         "required_state_units": MappingProxyType(
             {n: unit for n, unit in floating_state_units.items() if n not in placed_states}
         ),
+        # Names of the joints of each closed loop, also of floating ones that the loop places.
         "joint_loops": tuple(
             frozenset(loop_joints[k].name for k in group)
             for group in coupled_joints(model, [j.velocity for j in loop_joints])
         ),
         "base_orientations": MappingProxyType(dict(robot.base_orientations)),
+        # Indices of the coordinates of each closed loop.
         "loops": tuple(map(frozenset, coupled_joints(model, [j.velocity for j in joints]))),
         "places": list_places(robot, [(c.name, c.unit) for c in channels]),
         "alone": tuple(

@@ -218,6 +218,9 @@ class ServoSystem(PendulumSystem):
 
         With duty = clip(kp error_gain (goal - q), -1, 1) (2), the torque is
         kt (duty voltage - kt q') / resistance (3), and zero unless the input `torque_enable` is 1.
+
+        Args:
+            moment: state snapshot; its `x` (L, 1) is the angle q, and its `v` (L, 1) the rate q'.
         """
         k = moment.constants
         kt = moment.theta[:, _TORQUE_CONSTANT]

@@ -76,7 +76,7 @@ def compute_masked_background(
             distances = np.hypot(columns - u, rows - v)
             mask |= distances < _HIDDEN_RADII * radius + _HIDDEN_MARGIN_PIXELS
     is_partly_hidden = hidden.any(axis=0) & ~hidden.all(axis=0)
-    # (n, pixels, 3)
+    # (n, pixels, 3): only the pixels that are hidden in some pictures.
     colours = np.stack(pictures)[:, is_partly_hidden].astype(np.float32)
     visible_colours = np.where(hidden[:, is_partly_hidden, None], np.nan, colours)
     result = previous.copy()

@@ -160,6 +160,7 @@ def make_detector(pictures: list[RgbImage]) -> BallDetector:
         sigma = background_model.estimate_camera_noise(pictures, background)
         shadow_detector = BallDetector(background, sigma, shadows=True)
         plain_detector = BallDetector(background, sigma, shadows=False)
+        # Ghosts show where the background still contains an object.
         shadow_detections = [shadow_detector.detect(p, ghosts=True) for p in pictures[::stride]]
         plain_detections = [plain_detector.detect(p, ghosts=True) for p in pictures[::stride]]
         # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
@@ -308,7 +309,7 @@ class BallDetector:
             shadow_mask = np.zeros(mask.shape, bool)
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         # The largest regions are those with the longest contours; the index avoids that contours of
-        # equal length are compared.
+        # equal length are compared. Contours of up to three pixels are too small for a ball.
         lengths = [(len(c), i) for i, c in enumerate(contours) if len(c) > 3]
         longest_contours = sorted(lengths, reverse=True)[:_MAX_REGIONS]
         detections = []
@@ -385,7 +386,8 @@ class BallDetector:
     ) -> bool:
         """Return whether an object is in the background image and not in the picture.
 
-        There it differs more from its surroundings than in the picture.
+        There it differs more from its surroundings than in the picture, by more than half of
+        `level`, the difference in grey levels from which a pixel counts as changed.
 
         Args:
             picture_colours: Colours (3,) inside and around the object in the picture.
@@ -430,6 +432,8 @@ class BallDetector:
         shadow_factor = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
         darkest, lightest = _SHADOW_FACTOR_RANGE
         is_shadow = (shadow_factor > darkest) & (shadow_factor < lightest)
+        # Shadow changes all colours by one factor; noise with standard deviation `sigma` is
+        # tolerated.
         is_shadow &= scaled_deviations < max(_MAX_SHADOW_DEVIATION, 3 * self.sigma)
         brightness_ratio[rows, columns] = np.where(is_shadow, factor, 0)
         return brightness_ratio
@@ -469,6 +473,7 @@ class BallDetector:
         distance_map = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
         row, column = np.unravel_index(int(distance_map.argmax()), distance_map.shape)
         radius = max(float(distance_map[row, column]), 1.0)
+        # Centre of the disc in the picture, without the border.
         u = left + float(column) - 1
         v = top + float(row) - 1
         # In the window, shadow counts as background unless the region encloses it.
@@ -483,7 +488,7 @@ class BallDetector:
         cv2.drawContours(shadow_mask, [contour], -1, 0, -1, offset=offset)
         cv2.drawContours(shadow_mask, [contour], -1, 0, _UNSHADED_RIM_PIXELS, offset=offset)
         windows[:, shadow_mask > 0] = 0
-        # In a few pixels, rays do not find an edge.
+        # In a few pixels, rays do not find an edge. `windows[1]` is the colour that differs most.
         if radius < _MIN_RAY_RADIUS:
             return self._measure_small_ball(windows[1], u - u0, v - v0, radius, u0, v0)
         return self._fit_circle(windows, (u - u0, v - v0, radius), u0, v0)
@@ -537,6 +542,7 @@ class BallDetector:
             is_on_circle = circle_fit.find_inliers(fitted)
             if change < _CONVERGED_PIXELS:
                 break
+        # Share of all rays, also of those without an edge.
         agreement = float(is_on_circle.sum()) / _RAY_COUNT
         height, width = windows.shape[1:]
         # A centre outside the window belongs to an arc of a large object.
@@ -554,6 +560,7 @@ class BallDetector:
         value just inside the edge. That value is taken for each ray, because the brightness of a
         lit ball varies. The difference of brightness is used where it is large enough, because
         video files store colours at half the resolution; otherwise that of the worst colour.
+        Thresholds are multiples of `level`, the difference from which a pixel counts as changed.
 
         Args:
             windows: (2, height, width) differences from the background: of brightness, and of the
@@ -566,6 +573,7 @@ class BallDetector:
             (n, 2) edge points (u, v) in the window, for the n rays with an edge; None if they are
             less than half of the rays.
         """
+        # Each ray is sampled between two distances around the expected edge, pixels.
         start = max(0.0, _RAY_SHARES[0] * radius - _RAY_MARGIN)
         end = _RAY_SHARES[1] * radius + _RAY_MARGIN
         distances = np.arange(start, end, _RAY_SAMPLE_SPACING, dtype=np.float32)
@@ -597,8 +605,9 @@ class BallDetector:
         )
         is_bright = inner_brightness > _MIN_BRIGHTNESS_LEVELS * self.level
         is_bright &= inner_brightness > _MIN_BRIGHTNESS_SHARE * inner_colour
-        values = np.where(is_bright[:, None], *profiles)
+        values = np.where(is_bright[:, None], *profiles)  # brightness, or else the worst colour
         half_level = 0.5 * np.where(is_bright, inner_brightness, inner_colour)
+        # (rays, samples - 1): whether the edge is between a sample and the next one.
         is_crossing = values[:, 1:] < half_level[:, None]
         is_crossing &= values[:, :-1] >= half_level[:, None]
         # A dark patch further inside is not an edge.
@@ -631,6 +640,8 @@ class BallDetector:
         v0: int,
     ) -> BallDetection | None:
         """Measure a ball of a few pixels: centroid of the difference, and radius from its sum.
+
+        Thresholds are multiples of `level`, the difference from which a pixel counts as changed.
 
         Args:
             window: (height, width) differences of the worst colour from the background, grey

@@ -412,7 +412,7 @@ class BallScene:
         """
         pybullet = bullet_world.import_pybullet()
         camera = self.camera
-        left, top, right, bottom = window
+        left, top, right, bottom = window  # right and bottom are exclusive
         width = right - left
         height = bottom - top
         # Size of a pixel on the near plane, m.
@@ -426,6 +426,7 @@ class BallScene:
         right_edge = right - 0.5 - u
         lower_edge = bottom - 0.5 - v
         upper_edge = top - 0.5 - v
+        # The renderer's vertical axis points up, but the rows of a picture are counted downwards.
         projection = pybullet.computeProjectionMatrix(
             pixel_size * left_edge,
             pixel_size * right_edge,
@@ -451,6 +452,7 @@ class BallScene:
         coverage = is_body.mean(axis=(1, 3), dtype=np.float32)
         colour = np.reshape(colours, (*grouped, 4))[..., :3]  # without transparency
         sums = np.where(is_body, colour, 0).sum(axis=(1, 3), dtype=np.float32)
+        # At least 1, so that pixels without the body are not divided by zero.
         count = np.maximum(coverage * oversampling**2, 1)
         return sums / count, coverage
 

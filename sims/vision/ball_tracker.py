@@ -502,7 +502,7 @@ def _refine_with_smooth_radius(
         # Weights with heavy tails: measurements of other objects must not affect the trend.
         width = max(float(np.median(deviations)), _MIN_RADIUS_UNCERTAINTY)
         weights = 1 / (1 + (deviations / width) ** 2)
-    fitted = np.maximum(basis @ trend, 0.5)
+    fitted = np.maximum(basis @ trend, 0.5)  # a trend may reach zero, a radius must not
     tolerance = np.maximum(_MAX_RADIUS_DEVIATION * fitted, 1.0)
     is_wrong = np.abs(radius - fitted) > tolerance
     refitted = [s.refit_with_radius(float(r)) for s, r in zip(detections, fitted, strict=True)]

@@ -219,7 +219,8 @@ def fit_centre(
     """Fit the centre of a circle with a known radius to most of the points by Gauss-Newton.
 
     With their distance d from the centre and the unit vector n towards them, each step solves
-    d - radius = n . (du, dv) (2) by weighted least squares, with the weights (5).
+    d - radius = n . (du, dv) (2) by weighted least squares. The weights are those of Geman and
+    McClure, 1 / (1 + (residual / width)^2)^2 (5), with the residual d - radius (1).
 
     Args:
         points: Points (n, 2), pixels.

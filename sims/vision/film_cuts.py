@@ -68,6 +68,7 @@ def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
         frame_size = width, height
         pixel_stride = max(1, int((height * width / _SURVEY_PIXELS) ** 0.5))
         thinned = picture[::pixel_stride, ::pixel_stride].astype(np.int16)
+        # The first frame is compared with itself: no motion.
         reference_frame = thinned if previous_frame is None else previous_frame
         # Largest change of the three colours of each pixel.
         change = np.abs(thinned - reference_frame).max(axis=2)

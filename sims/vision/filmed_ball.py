@@ -160,6 +160,8 @@ def _make_camera(constants: Mapping[str, float]) -> PinholeCamera:
 def _track_film(camera: PinholeCamera, radius: float, centres: Array, times: Array) -> Array:
     """Render a film of a ball, and return the pixel rows (T,) that the tracker finds in it.
 
+    Shapes: T frames.
+
     A row is NaN in frames in which the tracker finds no ball, and all are if the motion is not
     finite.
 
@@ -199,7 +201,8 @@ def _track_film(camera: PinholeCamera, radius: float, centres: Array, times: Arr
         return pixel_rows
     finally:
         scene.close()
-    # A track may lack frames, so the number of each frame is found by its time.
+    # A track may lack frames, so the number of each frame is found by its time in the film, which
+    # begins at 0.
     frames = np.interp(track.times, times - times[0], np.arange(times.size))
     pixel_rows[np.rint(frames).astype(int)] = track.v
     return pixel_rows

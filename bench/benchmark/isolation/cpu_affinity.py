@@ -26,7 +26,9 @@ class AffinityController:
     """
 
     def __init__(self) -> None:
+        """Begin without a pin; times are those of `perf_counter` in seconds."""
         self._exchange_count = 0
+        # Beginning of the present block of exchanges, whose mean duration is measured.
         self._measured_since = perf_counter()
         self._is_pinned = False
         self._pinned_until = 0.0

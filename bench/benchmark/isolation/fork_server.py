@@ -91,6 +91,7 @@ def serve_fork_requests(descriptor: int) -> None:
                 finally:
                     # Without the exit, the fork would continue as a second fork server.
                     os._exit(1)
+            # The fork has its own copies of the descriptors.
             for descriptor_copy in descriptors:
                 os.close(descriptor_copy)
             link.sendall(b"K")
@@ -123,7 +124,8 @@ def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: 
         layers: names of the isolation layers that are active already.
     """
     set_parent_death_signal()
-    # The fork server ignores this signal; with that, no exit code of a child could be waited for.
+    # The fork server ignores this signal, and a fork inherits this. The kernel would then discard
+    # the exit code of a child before it could be read.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     control, *pipes = descriptors
     layers = [

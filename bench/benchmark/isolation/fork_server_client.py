@@ -125,6 +125,7 @@ class ForkServerClient:
             "readable": [*list_readable_paths((*hidden, str(Path.cwd()))), *files],
             "memory": memory,
         }
+        # A pipe has a reading end, given first, and a writing end.
         (reading, child_writing), (child_reading, writing) = os.pipe(), os.pipe()
         control, child_control = socket.socketpair()
         descriptors = child_control.fileno(), child_reading, child_writing
@@ -136,6 +137,8 @@ class ForkServerClient:
             os.close(writing)
             raise
         finally:
+            # The process has its own copies. While a copy is open here, no end of file arrives when
+            # the process ends.
             child_control.close()
             os.close(child_reading)
             os.close(child_writing)

@@ -77,10 +77,14 @@ def list_readable_paths(hidden: tuple[str, ...]) -> tuple[str, ...]:
 
 @cache
 def _list_readable_paths(hidden: tuple[str, ...], packages: tuple[str, ...]) -> tuple[str, ...]:
-    """List the readable paths for given hidden folders and a given `sys.path` (`packages`).
+    """List the files and folders that a tuner process may read; see `list_readable_paths`.
 
     A folder of packages that contains a hidden one is left out, and of the project only the folders
     with code are listed. The result is cached, because every start of a tuner process needs it.
+
+    Args:
+        hidden: folders that must not be accessible.
+        packages: present value of `sys.path`, on which the cached result depends.
     """
     hidden_paths = [Path(path).resolve() for path in hidden]
     interpreter = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}

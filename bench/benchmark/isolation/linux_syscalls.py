@@ -266,8 +266,10 @@ def restrict_file_access(readable: Iterable[str], writable: Iterable[str]) -> No
     version = get_landlock_version()
     if not version:
         raise OSError("the kernel has no Landlock")
+    # Bits of all rights that this version knows; they are forbidden unless a rule permits them.
     all_rights = sum(rights for min_version, rights in _LANDLOCK_ALL if min_version <= version)
-    # Versions 4 and 6 extended the structure, and the kernel accepts the shorter ones.
+    # The C structure landlock_ruleset_attr. Versions 4 and 6 extended it, and the kernel accepts
+    # the shorter ones.
     fields = [all_rights]
     if version >= 4:
         fields.append(_LANDLOCK_TCP)

@@ -199,8 +199,13 @@ class MessageChannel:
     def _write_message(self, message: bytes, deadline: float) -> None:
         """Write the whole message, in several parts if the pipe is full.
 
-        Raises TimeoutError at the deadline (a time of `perf_counter`), PeerClosedError if the other
-        side has closed the pipe.
+        Args:
+            message: header and body.
+            deadline: latest time, as of `perf_counter`.
+
+        Raises:
+            PeerClosedError: the other side has closed the pipe.
+            TimeoutError: the other side does not read in time.
         """
         unsent = memoryview(message)
         while unsent:
@@ -259,10 +264,15 @@ class MessageChannel:
         return memoryview(body)
 
     def _read_available_bytes(self, into: memoryview, deadline: float) -> int:
-        """Read the bytes that are available into `into`, at least one, and return their number.
+        """Read the bytes that are available, at least one, and return their number.
 
-        Raises TimeoutError if nothing arrives before the deadline, PeerClosedError if the pipe is
-        closed.
+        Args:
+            into: buffer to which they are written, from its beginning; its length is the limit.
+            deadline: latest time, as of `perf_counter`.
+
+        Raises:
+            PeerClosedError: the other side has closed the pipe.
+            TimeoutError: nothing arrives before the deadline.
         """
         # `poll` comes before `readv`, because a blocking read could not stop at the deadline.
         if not self._incoming.poll(_compute_poll_timeout(deadline)):
@@ -286,6 +296,9 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:
     """Pack named arrays into the parts of a body: a line of JSON, then the bytes of the arrays.
 
     The line has the name, type and shape of each. Unlike pickle, reading them runs no code.
+
+    Returns:
+        The line, and the bytes of each array.
 
     Raises:
         ValueError: an array has a type that is not permitted.

@@ -117,17 +117,23 @@ class ArgumentRule(NamedTuple):
 def list_rules(process: int, has_memory_limit: bool) -> dict[str, int | ArgumentRule]:
     """Return the verdict or the rule for each system call that is not allowed in general.
 
-    Listed calls fail with EPERM (not permitted) unless another verdict is stated. Calls that are
-    harmless with some arguments have a rule that depends on an argument; for example, a process may
-    send signals to itself only.
+    These are the calls in `_SYSCALL_NUMBERS`; all others are allowed. They fail with EPERM (not
+    permitted) unless another verdict is stated. Calls that are harmless with some arguments have a
+    rule that depends on an argument; for example, a process may send signals to itself only.
 
     Args:
         process: process id of the process that is restricted.
         has_memory_limit: True if calls that allocate uncounted memory are blocked too.
+
+    Returns:
+        Verdict, such as `_ALLOW`, `_EPERM` or `_DO_NOTHING` (succeed without effect), or the rule
+        that gives it, by name of the call.
     """
+    # The first argument of these calls is the process that gets the signal.
     only_itself = ArgumentRule(0, {process: _ALLOW}, _EPERM)
     rules: dict[str, int | ArgumentRule] = {
-        # The calls of x86_64 include those of all supported machines.
+        # The default, which entries below replace. The names for x86_64 include those of all
+        # supported machines.
         **dict.fromkeys(_SYSCALL_NUMBERS["x86_64"], _EPERM),
         # Libraries try these first, and use other calls if the kernel reports that they are absent.
         **dict.fromkeys(("clone3", "io_uring_setup"), _ENOSYS),
@@ -150,6 +156,7 @@ def list_rules(process: int, has_memory_limit: bool) -> dict[str, int | Argument
         "capset": _ALLOW,  # capabilities can only be given up
         **dict.fromkeys(("memfd_create", "memfd_secret", "mmap"), _ALLOW),
     }  # fmt: skip
+    # Shared anonymous memory is not counted by the limit.
     if has_memory_limit:
         shared = {_SHARED_ANONYMOUS_MAP: _ENOMEM}
         rules |= {
@@ -217,9 +224,13 @@ def build_filter(machine: str, rules: Mapping[str, int | ArgumentRule]) -> list[
 
     Args:
         machine: machine, as of `platform.machine`.
-        rules: verdict or rule by name of the call.
+        rules: verdict or rule by name of the call, from `list_rules`.
+
+    Returns:
+        Instructions in the order in which they are executed.
     """
     program = [BpfInstruction(_LOAD, _ARCHITECTURE_OFFSET)]
+    # The right architecture skips the next instruction, which kills the process.
     program += [BpfInstruction(_EQUAL, _ARCHITECTURES[machine], skip_if_true=1), *_emit_rule(_KILL)]
     program += [
         BpfInstruction(_LOAD, _NUMBER_OFFSET),

@@ -208,7 +208,8 @@ class IsolatedProcess:
     def written(self) -> Written:
         """Return the files that the tuner has written to its folder since the last call.
 
-        The result is empty if the process does not answer; its report is optional.
+        They are deleted with the process, so a note informs the author of the tuner. The
+        result is empty if the process does not answer; its report is optional.
         """
         if not self._open:
             return NOTHING_WRITTEN
@@ -412,7 +413,8 @@ class IsolatedRun:
                     evaluation.proposals.tobytes(),
                     evaluation.losses.tobytes(),
                     evaluation.observations.tobytes(),
-                    # They tell the process on which processor to run.
+                    # The flags tell the process on which processor to run, which is faster if
+                    # messages alternate quickly.
                     flags=affinity_controller.record_exchange(),
                     size=len(evaluation.losses),
                     deadline=deadline,
@@ -440,7 +442,8 @@ class IsolatedRun:
                 reached.
         """
         child = self.tuner.child
-        # 8 bytes per float64, for all points of the budget and a recommendation.
+        # 8 bytes per float64, for a recommendation, all points of the budget, and one more point,
+        # by which a tuner exceeds its budget.
         limit = min(MAX_PROPOSAL_BYTES, 8 * task.dim * (task.budget + 2))
         message = child.receive(max(limit, MAX_TEXT_BYTES), deadline)
         if message.kind == MessageKind.STOPPED:
@@ -504,6 +507,7 @@ def train_remotely(
         flags=callback is not None,  # whether to report progress
         deadline=_NO_DEADLINE,
     )
+    # That for evaluation is added when it is first used.
     simulators: list[TrainingSimulator] = [simulator]
     while True:
         message = child.receive(MAX_STATE_BYTES, _NO_DEADLINE)
@@ -556,7 +560,9 @@ def _handle_training_message(
 
 
 def _parse_progress(document: Any) -> tuple[str, int, int, float, float]:
-    """Parse a progress message: stage, epoch, number of epochs, and two losses.
+    """Parse a progress message: stage, epoch, number of epochs, training and held-out loss.
+
+    Code of the tuner may have sent any values, so they are converted to the expected types.
 
     Raises:
         ProtocolError: the message has another content.

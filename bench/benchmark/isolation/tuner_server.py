@@ -126,12 +126,16 @@ def _report_failure(channel: MessageChannel, text: str) -> None:
 def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | None) -> Tuner | None:
     """Execute the request of one message, and return the present tuner.
 
-    A request builds a tuner, loads its weights, runs it on a task, or trains it.
+    A request builds a tuner, loads its weights, runs it on a task, or trains it. A message of
+    another kind is ignored.
 
     Args:
         channel: Channel to the harness.
         message: Request of the harness.
         tuner: Tuner that was built before; None before the first request.
+
+    Returns:
+        The new tuner after a request to build one, otherwise `tuner`.
     """
     if message.kind == MessageKind.BUILD:
         description = message.to_document()
@@ -282,6 +286,7 @@ def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: 
             set_processor(answer.flags)
         numbers, point_count = answer.to_array(), answer.size
         used_simulations += point_count
+        # Positions in `numbers`, which has the points, then the losses, then the observations.
         losses_start = point_count * dim
         observations_start = losses_start + point_count
         proposals = numbers[:losses_start].reshape(point_count, dim)
@@ -344,7 +349,7 @@ class _RemoteTrainingSimulator:
         """
         state = rng.bit_generator.state
         is_sendable = state["bit_generator"] == "PCG64"
-        # A generator of another type seeds a new PCG64 generator, which can be sent.
+        # Only the state of a PCG64 generator can be sent. One of another type seeds a new one.
         rng_state = (
             state if is_sendable else np.random.PCG64(rng.integers(0, 1 << 62, 4).tolist()).state
         )

@@ -518,7 +518,42 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     tuners = _parse_tuner_entries(path, document.get("tuners", {}))
     entries = {key: value for key, value in document.items() if key != "tuners"}
     fields = check_entries(path, "", entries, hints)
-    # The simulator is a robot's model file, or a registered one, or those of named experiments.
+    _complete_simulator_fields(fields, path)
+    # Paths are made absolute here: workers and result folders do not know this file's location.
+    if "recording" in fields:
+        fields["recording"] = RecordingSource(
+            resolve_recording_path(fields["recording"].path, path)
+        )
+    try:
+        experiment = Experiment(name=name, tuners=tuners, **fields)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    _expand_combinations(experiment, path)  # an error in a swept value is an error of this file
+    # A suite, a versioned set of problems, states their hashes; one of questions to diagnosers has
+    # a single hash for all of them. The stored configuration of a
+    # result states none, because it may select some of the questions.
+    if experiment.suite and experiment.diagnosis and experiment.problem_hashes:
+        question_hash = _hash_tables(
+            {k: document["diagnosis"].get(k) for k in ("seed", "questions")}
+        )
+        _check_problem_hash(experiment.suite, experiment.problem_hashes, "questions", question_hash)
+    return experiment
+
+
+def _complete_simulator_fields(fields: dict[str, Any], path: Path) -> None:
+    """Check and complete the fields of an experiment file that say what is simulated.
+
+    It is a robot's model file, or a registered simulator, or those of named experiments; only a
+    comparison of diagnosers needs none. Relative paths are made absolute, and a robot without a
+    name is named after its model file.
+
+    Args:
+        fields: fields of the experiment that the file has, changed in place.
+        path: path of the file, for messages and for relative paths.
+
+    Raises:
+        InputError: nothing is named, or the fields contradict each other.
+    """
     if model := fields.get("model"):
         fields["model"] = resolve_model_path(model, path)
         fields.setdefault("simulator", check_name(Path(model).stem))
@@ -535,24 +570,6 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
         )
     elif not fields.get("simulator") and not fields.get("diagnosis"):
         raise InputError(f'{path}: expected simulator = "NAME" or model = "FILE", found none')
-    # Paths are made absolute here: workers and result folders do not know this file's location.
-    if "recording" in fields:
-        fields["recording"] = RecordingSource(
-            resolve_recording_path(fields["recording"].path, path)
-        )
-    try:
-        experiment = Experiment(name=name, tuners=tuners, **fields)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    _expand_combinations(experiment, path)  # an error in a swept value is an error of this file
-    # A suite of diagnoser questions states the hash of all of them. The stored configuration of a
-    # result states none, because it may select some of the questions.
-    if experiment.suite and experiment.diagnosis and experiment.problem_hashes:
-        question_hash = _hash_tables(
-            {k: document["diagnosis"].get(k) for k in ("seed", "questions")}
-        )
-        _check_problem_hash(experiment.suite, experiment.problem_hashes, "questions", question_hash)
-    return experiment
 
 
 def resolve_model_path(model: str, experiment: Path) -> str:
@@ -661,7 +678,8 @@ def expand_sweep(experiment: Experiment) -> list[Experiment]:
 def _load_named_experiments(suite: Experiment, name: str) -> list[Experiment]:
     """Load one of the experiments that a suite names, with the numbers and tuners of the suite.
 
-    This is how one file runs many problems with the same settings.
+    This is how one file runs many problems with the same settings. If the suite has a name and a
+    version (`suite.suite`), it states a hash of each problem, which is compared with its file.
 
     Args:
         suite: experiment that names others.
@@ -680,7 +698,8 @@ def _load_named_experiments(suite: Experiment, name: str) -> list[Experiment]:
         file = find_experiment_file(name)
         problem_hash = compute_problem_hash(file, frozenset(_UNHASHED_KEYS))
         _check_problem_hash(suite.suite, suite.problem_hashes, experiment.name, problem_hash)
-    # Tuners are replaced as a whole: options of one experiment may be invalid in the other.
+    # Numbers such as budget and seeds are those of the suite. Its tuners, if it names any, replace
+    # all others: options of one experiment may be invalid in the other.
     shared = {key: getattr(suite, key) for key in SHARED_KEYS if key != "tuners" or suite.tuners}
     return expand_sweep(experiment.chosen(**shared))
 
@@ -688,8 +707,16 @@ def _load_named_experiments(suite: Experiment, name: str) -> list[Experiment]:
 def _expand_combinations(experiment: Experiment, path: Path) -> list[Experiment]:
     """Expand a sweep to one experiment for each combination of values.
 
-    A sweep lists several values of one or more keys. An experiment without a sweep is returned
-    alone. Each combination is named ``NAME[key=value,...]``. `path` is only used in error messages.
+    A sweep lists several values of one or more keys. Each combination is named
+    ``NAME[key=value,...]``.
+
+    Args:
+        experiment: experiment that may have a sweep.
+        path: path of its file, for messages.
+
+    Returns:
+        The experiments without a sweep. An experiment that has none, or that names other
+        experiments, which are expanded elsewhere, is returned alone.
     """
     if not experiment.sweep or experiment.experiments:
         return [experiment]
@@ -746,7 +773,10 @@ def _iterate_swept_documents(
 def _check_sweep_values(path: Path, key: str, values: Sequence[Any]) -> None:
     """Raise an error for a key of a sweep that has no values, or the same value twice.
 
-    `key` is the key in the file, for the message.
+    Args:
+        path: path of the experiment file, for messages.
+        key: key in the file, such as ``sweep.budget``, for messages.
+        values: values of the key.
     """
     if not values:
         raise make_error(path, key, "at least one value", values)
@@ -798,7 +828,11 @@ def _insert_value(path: Path, document: dict[str, Any], key: str, value: Any) ->
 
 
 def _get_first_key(table: Mapping[str, Any], key: str) -> str:
-    """Return the part of a key that names an entry of the table; effect names can contain dots."""
+    """Return the first part of a key with dots, the name of an entry of the table.
+
+    It ends at the first dot, unless the table has a longer matching name: effect names can contain
+    dots.
+    """
     matching_names = [name for name in table if key == name or key.startswith(f"{name}.")]
     # A part that is not in the table is a new table, or a key that later checks refuse.
     return max(matching_names, key=len, default=key.partition(".")[0])

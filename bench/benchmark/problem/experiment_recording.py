@@ -48,6 +48,9 @@ def load_recorded_runs(path: str, simulator: Simulator) -> RecordedRuns:
         path: path of the recording, see `find_recording`.
         simulator: simulator whose channels are read.
 
+    Returns:
+        The runs to fit, the held-out runs, and the noise of the channels.
+
     Raises:
         InputError: the recording cannot be found or read, or lacks a channel of the simulator.
     """

@@ -163,15 +163,20 @@ def compute_spectrum(
         parameters: parameters with their bounds and training ranges.
         scale: (C,) standard deviation of each channel's white noise, or its typical magnitude if
             the noise is not known.
+
+    Returns:
+        Eigenvalues and eigenvectors of the Fisher information J^T J.
     """
     low, high = np.array([p.bounds for p in parameters]).T
     ranges = np.array([p.training_range for p in parameters])
     widths = ranges[:, 1] - ranges[:, 0]
     dim = len(parameters)
-    # The first dim points have one parameter increased, the others have it decreased.
+    # One row for each simulated point: the first dim ones have one parameter increased, the others
+    # have it decreased.
     steps = np.concatenate([np.diag(widths), -np.diag(widths)])
     shifted_parameters = np.clip(truth + FINITE_DIFFERENCE_STEP * steps, low, high)
-    # At a bound only one side moves, and the difference is divided by the shorter step.
+    # Distance of both points in training ranges. At a bound only one side moves, and the difference
+    # is divided by the shorter step.
     step_widths = np.diagonal(shifted_parameters[:dim] - shifted_parameters[dim:]) / widths
     observations = simulate(shifted_parameters)
     changes = (observations[:dim] - observations[dim:]) / scale

@@ -46,6 +46,7 @@ def availability(experiment: Experiment) -> Availability:
     if experiment.experiments:
         return _combine_availability(experiment)
     data_set = _find_missing_data_set(experiment)
+    # The first reason is reported; an empty one means that nothing of the kind is missing.
     reason = ""
     if data_set is None:
         reason = explain_missing_model_file(experiment) or _explain_missing_recording(experiment)
@@ -101,11 +102,15 @@ def _combine_availability(experiment: Experiment) -> Availability:
     """Combine what is missing for the experiments that this one names.
 
     Only the first missing data set is reported; the others follow when it has been downloaded.
-    A suite leaves out the problems that cannot run, see `leave_out_missing_problems`: something is
-    missing for it only if no problem can run.
+    A suite, a versioned set of problems, leaves out the problems that cannot run, see
+    `leave_out_missing_problems`: something is missing for it only if no problem can run.
 
     Args:
-        experiment: Sweep or suite that names other experiments.
+        experiment: Experiment or suite that names other experiments.
+
+    Returns:
+        The first missing data set, the reasons of all experiments that cannot run, in one text, and
+        the reasons of tuners that cannot run.
     """
     missing_by_name = {part.name: availability(part) for part in expand_sweep(experiment)}
     runnable = {

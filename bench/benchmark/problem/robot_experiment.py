@@ -115,7 +115,9 @@ def find_model(path: str, name: str) -> Path:
 def _find_packaged_model(path: str, name: str) -> Path:
     """Find a model file inside an installed Python package, given as ``package://NAME/FILE``.
 
-    `path` is this address, and `name` the experiment that needs the file.
+    Args:
+        path: this address.
+        name: name of the experiment that needs the file, for messages.
 
     Raises:
         InputError: the address is not of this form.

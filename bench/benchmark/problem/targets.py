@@ -119,6 +119,9 @@ def draw_targets(problem: TargetProblem) -> list[Target]:
     Args:
         problem: problem of the experiment.
 
+    Returns:
+        `experiment.targets` targets for each range, in the order of their numbers.
+
     Raises:
         InputError: all of `MAX_DRAWS` draws of a target diverge.
     """
@@ -172,7 +175,10 @@ def count_redraws(experiment: Experiment, drawn_targets: Sequence[Target]) -> Re
 def _make_divergence_error(experiment: Experiment, failed: int, draws: int) -> InputError:
     """Make the error for an experiment too many of whose targets diverge when they are simulated.
 
-    `failed` of `draws` simulations diverged.
+    Args:
+        experiment: configuration of the experiment, for its name.
+        failed: number of simulations that diverged.
+        draws: number of all simulations.
     """
     return InputError(
         f"experiment {experiment.name}: the simulation of {failed} of {draws} targets drawn "
@@ -196,6 +202,7 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     experiment_name = problem.experiment.same_targets_as or problem.experiment.name
     redraw_names = ("redraw", number) if number else ()
     streams = TargetStreams(problem.salt, experiment_name, kind, index, *redraw_names)
+    # Lower and upper limits in the unit cube, between which start and true parameters are drawn.
     box = _CUBE_CORNERS if kind == "wide" else problem.cube.training
     # The start is drawn first: with a public salt, all quantities share one stream.
     start, truth = (
@@ -207,7 +214,7 @@ def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> 
     # The true parameters of a recording are not known; only the start is drawn.
     if recording:
         return Target(BlindedTarget(name, kind, start, recording.fitting, recording.held_out), None)
-    # This is one scenario, because only recordings have several runs.
+    # There is one scenario, because only recordings have several runs.
     scenarios = problem.draw_scenarios(streams.get_stream("scenario"))
     # The parameters of `world` are the first of the tuned ones.
     theta = problem.cube.to_physical(truth[None])[:, : len(problem.world.parameters)]

@@ -137,7 +137,7 @@ class RandomisedSimulator:
         experiment = problem.experiment
         ranges = dict(experiment.nuisance)
         settings: dict[str, Any] = dict(experiment.settings)
-        # The effects that the simulator was extended with are known, and keep their coefficients.
+        # Effects that the tuned simulator already has with fixed coefficients keep them.
         fixed_effects = settings.get("fixed", {})
         ranges = {
             name: limits

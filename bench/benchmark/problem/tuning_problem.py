@@ -67,8 +67,10 @@ class TuningProblem:
         """Build the simulators, and read the recording if the experiment has one.
 
         `simulator` is tuned, `world` is the true system that makes the targets (the same unless the
-        experiment names another), `cube` maps parameters to the unit cube, and `noise` and `scale`
-        are those of the channels.
+        experiment names another), and `cube` maps parameters to the unit cube. For C channels,
+        `noise` (C,) is the standard deviation of their noise, 0 for none, and `scale` (C,) divides
+        their errors. `error_channel` is the index of the channel whose error is reported, and
+        `simulated` counts the simulated points.
 
         Args:
             experiment: experiment that neither sweeps over values nor names other experiments.
@@ -296,9 +298,10 @@ class ProposalEvaluator:
         """Prepare factors that convert sums of squared errors to the loss (1) and to the RMSE (2).
 
         There are C channels, of which channel c has N_c samples and the scale s_c. `_mean_factors`
-        and `_loss_factors` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1). `_missing`
-        marks missing samples (T, C); it is None if no sample is missing. `_evaluated_squares`
-        collects the sums of squares (n, C) of all batches, in which `compute_rmse` looks up points.
+        and `_loss_factors` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1);
+        `_single_loss_factor` is the latter as a number, for a single channel. `_missing` marks
+        missing samples (T, C); it is None if no sample is missing. `_evaluated_squares` collects
+        the sums of squares (n, C) of all batches, in which `compute_rmse` looks up points.
 
         Args:
             problem: tuning problem.
@@ -309,7 +312,7 @@ class ProposalEvaluator:
         missing = np.isnan(side.observed)
         self._missing = missing if missing.any() else None
         self._observed = np.where(missing, 0.0, side.observed)
-        # For a channel without samples the divisor must not be zero.
+        # N_c of each channel; at least 1, because it is a divisor below.
         sample_counts = np.maximum((~missing).sum(axis=0), 1)
         self._mean_factors = 1.0 / sample_counts  # (2)
         self._loss_factors = 1.0 / (sample_counts * problem.scale**2 * len(problem.scale))  # (1)

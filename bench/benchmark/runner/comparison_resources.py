@@ -162,9 +162,14 @@ def estimate_comparison_need(
         experiment: configuration without a sweep.
         jobs: number of worker processes; 0 for none.
         cluster: True if a cluster executes the runs.
+
+    Returns:
+        Memory and disk space in bytes, time steps of one simulation, and seconds, with a text of
+        the counts and a suggestion how to reduce the largest one.
     """
     sizes = _ExperimentSizes(experiment)
-    # For a bounce shot this counts its shots with one ball; it has only a few balls.
+    # For a bounce shot (table [shot]), `targets` is the number of shots with each ball. Only one
+    # ball is counted, since there are only a few.
     targets = experiment.targets * len(experiment.ranges)
     seeds_and_budgets = [
         # A tuner may have its own budget; otherwise that of the experiment applies.
@@ -183,7 +188,7 @@ def estimate_comparison_need(
         # One fitted observation and the held-out ones for each target.
         + targets * (1 + held_out) * sizes.observation
         + row_count * _ROW_MEMORY
-        # The workers of a cluster run on other machines.
+        # The worker processes; those of a cluster run on other machines.
         + (0 if cluster else jobs * _WORKER_BYTES)
         # The largest run stores its proposals and their losses.
         + max_budget * (sizes.dim + 1) * BYTES_PER_NUMBER
@@ -192,6 +197,7 @@ def estimate_comparison_need(
         + sizes.steps * BYTES_PER_STEP
     )
     seconds = (
+        # Each recommended point is simulated in the held-out scenarios, too.
         simulations * sizes.simulation * (1 + held_out) / workers
         # At least one training, which one process executes.
         + training_simulations * sizes.simulation

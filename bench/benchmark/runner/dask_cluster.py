@@ -89,7 +89,7 @@ class ClusterPool:
             raise InputError(
                 'a cluster needs the package distributed (pip install -e ".[cluster]")'
             ) from None
-        # Dask's own log messages are suppressed; this class reports losses in one line.
+        # Dask's own log messages are suppressed; this class reports lost workers in one line.
         for name in [*logging.root.manager.loggerDict, "asyncio"]:
             if name.split(".")[0] in ("distributed", "tornado", "asyncio"):
                 # No message has a level above CRITICAL.
@@ -262,8 +262,14 @@ class ClusterPool:
         """Submit one call to the cluster, and return its future.
 
         The files that its arguments refer to are sent with it. The workers may have no common file
-        system, so the content of files such as trained weights is sent. `seconds` is the time limit
-        of the call.
+        system, so the content of files such as trained weights is sent.
+
+        Args:
+            call: function with its arguments.
+            seconds: soft time limit of the call.
+
+        Returns:
+            Future of Dask for the result of `run_on_worker`.
         """
         function, arguments = call
         transferable = [argument for argument in arguments if isinstance(argument, Transferable)]

@@ -153,7 +153,8 @@ class PlannedRun:
 def count_seeds(experiment: Experiment, entry: TunerEntry) -> int:
     """Return the number of seeds of an entry.
 
-    It is the entry's or the experiment's number, or one if the tuner is deterministic.
+    It is the entry's own number, or else that of the experiment, but one if the tuner is
+    deterministic: its runs would all be equal.
     """
     tuner_class = tuners.get(entry.tuner)
     # A learned tuner is trained with each seed, even if its runs use no random numbers.
@@ -266,6 +267,7 @@ def run_experiment(
         check_classes_importable(experiment, workers=pool is not None or jobs > 0)
     # This process has the true parameters, and a tuner's process may run as the same user.
     memory_protection = nullcontext() if experiment.trusted else not_dumpable()
+    # A given pool, such as that of a cluster, has priority over processes on this machine.
     with memory_protection, pool or make_pool(jobs) as workers:
         workers.load_plugins(describe_plugins(plugins, experiment))
         try:
@@ -297,12 +299,17 @@ def _store_untrained_runs(
 ) -> _ReadyRuns:
     """Store runs whose training failed as failures, and return the other missing runs.
 
-    A failure is a result too, so these runs are not tried again when the study is resumed.
+    A run is missing if it is in the plan and not stored yet. A failure is a result too, so these
+    runs are not tried again when the study is resumed.
 
     Args:
-        results: Runs of the experiment and their journal.
-        progress: Factory of progress displays.
+        results: Plan and stored runs of the experiment.
         failures: Errors of trainings by label of the tuner and seed.
+        progress: Makes a progress bar from a title and the number of steps.
+
+    Returns:
+        Indices in the plan of the runs that can be executed, and the callback that advances the
+        progress bar.
     """
     missing = [
         index for index in range(len(results.plan)) if index not in results.run_sink.statuses

@@ -95,6 +95,9 @@ def _make_stub(description: dict[str, Any]) -> Any:
         description: properties of the class, from `_validate_part`: ``says`` is the first
             paragraph of its docstring, ``trains_as`` the tuner whose random stream it trains with,
             ``source`` a hash of its source.
+
+    Returns:
+        Subclass of `TunerStub` or `DiagnoserStub`.
     """
     base = TunerStub if description["kind"] == "tuner" else DiagnoserStub
     fields: dict[str, Any] = {
@@ -239,6 +242,13 @@ def _list_extended_names(paths: Iterable[str]) -> set[str]:
 def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> None:
     """Raise an error if a file with a simulator or effect in use also has a tuner in use.
 
+    Such a file is loaded into this process, which has the true parameters; its tuner could read
+    them.
+
+    Args:
+        plugins: inspected plugin files; `is_loaded` is True if the simulator or effect is needed.
+        experiment: configuration with the tuners.
+
     Raises:
         InputError: there is such a file.
     """
@@ -253,6 +263,10 @@ def _make_untrusted_code_error(label: str, file: object) -> InputError:
     """Make the error for a tuner whose code has been loaded into this process.
 
     Such a tuner could read the true parameters, so its results would prove nothing.
+
+    Args:
+        label: label of the tuner.
+        file: path of the file with its code.
     """
     return InputError(
         f"tuner {label}: the code of {file} runs in this process, which has the true "
@@ -267,6 +281,10 @@ def describe_plugins(paths: Sequence[str], experiment: Experiment) -> list[Plugi
     If tuners are trusted, other processes load all files. Otherwise the result has descriptions of
     their tuners or diagnosers from the inspection, so that workers do not load this code either. A
     file that was not inspected yet is inspected now.
+
+    Args:
+        paths: plugin files.
+        experiment: configuration, which names the tuners and says whether they are trusted.
 
     Raises:
         InputError: a file cannot be used.
@@ -341,7 +359,8 @@ def _try_to_build(entry: TunerEntry) -> None:
 def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
     """Inspect plugin files in an isolated process, and decide which of them to load here.
 
-    A file is loaded if it defines a simulator or effect that is needed. Its names must not be in
+    The parts of a file are the tuners, diagnosers, simulators and effects that it defines. A file
+    is loaded if it defines a simulator or effect that is needed. Its names must not be in
     use, which is checked before its code runs.
 
     Args:
@@ -364,6 +383,7 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
             plugins.append(Plugin(path))
             continue
         parts = _ask_isolated_process({"file": path, "kind": "", "name": ""}, path)
+        # Tuners and diagnosers, whose code runs in isolated processes only.
         isolated_parts = tuple(part for part in parts if part["kind"] in _ISOLATED_REGISTRIES)
         needed_parts = [
             part for part in parts if part["name"] in needed_names and part not in isolated_parts
@@ -470,9 +490,13 @@ def _ask_isolated_process(question: dict[str, str], label: str) -> list[dict[str
 def _request_inspection(question: dict[str, str], files: list[str]) -> Any:
     """Start an isolated process, ask it one question about a plugin, and return its answer.
 
-    `question` names a plugin file, or an installed part by kind and name. `files` are the files
-    that the process may read. The answer is not validated yet: code of the plugin may have written
-    it.
+    Args:
+        question: names a plugin file, or an installed tuner or diagnoser by kind and name; see
+            `_ask_isolated_process`.
+        files: files that the process may read, in addition to Python and its packages.
+
+    Returns:
+        JSON value, not yet validated: code of the plugin may have written it.
     """
     child = get_fork_server().start_process(
         f"{__name__}:serve_inspection", files, modules=[__name__]
@@ -548,7 +572,10 @@ def serve_inspection(
 
 
 def _describe_plugin_file(file: str) -> list[dict[str, Any]]:
-    """Describe what a plugin file defines.
+    """Describe what a plugin file defines; runs in an isolated process, as it loads the file.
+
+    Returns:
+        Description of each tuner, diagnoser, simulator and effect, from `_describe_class`.
 
     Raises:
         InputError: the file cannot be loaded.
@@ -581,6 +608,9 @@ def _describe_class(kind: str, part: Any) -> dict[str, Any]:
     Args:
         kind: kind of the class, such as ``tuner``.
         part: the class.
+
+    Returns:
+        Values by name; with ``skipped``, the reason, if the class cannot be used here.
     """
     description = {"kind": kind, "name": part.name, "says": (part.__doc__ or "").split("\n\n")[0]}
     if kind not in _ISOLATED_REGISTRIES:

@@ -180,11 +180,13 @@ def _get_source_folders(experiment: Experiment) -> tuple[str, ...]:
 def _hash_class_sources(experiment: Experiment) -> list[str]:
     """Hash the sources of the simulator and the tuners or diagnosers, one hash each.
 
-    This covers classes that a notebook defines, which are in no plugin file.
+    A comparison of diagnosers has no simulator of its own. This covers classes that a notebook
+    defines, which are in no plugin file.
     """
     sources = []
     if not experiment.diagnosis:
         sources.append(hash_class_source(get_simulator_class(experiment)))
+    # The parts that are compared: tuners or diagnosers.
     for registry, name in list_compared_parts(experiment):
         try:
             sources.append(hash_class_source(registry.get(name)))
@@ -404,6 +406,9 @@ def _list_source_classes(kind: type) -> list[type]:
 
     Args:
         kind: Class whose behaviour is hashed.
+
+    Returns:
+        Classes without repetition and without those of the standard library.
     """
     classes: list[type] = []
     waiting = [kind]

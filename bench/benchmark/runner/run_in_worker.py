@@ -110,7 +110,10 @@ _problems: dict[int, tuple[Experiment, TuningProblem]] = {}
 
 
 def get_problem(experiment: Experiment) -> TuningProblem:
-    """Return the problem of an experiment; it is cached until another one is needed."""
+    """Return the problem of an experiment; it is cached until another one is needed.
+
+    Building a problem opens simulators, which takes time; a worker executes many runs of one.
+    """
     # There is at most one problem, under the key 0.
     cached = _problems.get(0)
     if cached is None or cached[0] != experiment:
@@ -157,10 +160,14 @@ def _execute_once(
         requests: points that the tuner requested before its process was killed; a repetition must
             request the same.
 
+    Returns:
+        Trace of the run, RMS errors of its recommendations, seconds, and files written.
+
     Raises:
         HiddenSimulationError: more points were simulated than the tuner requested from the harness.
         KilledExternallyError: the tuner's process was killed externally.
     """
+    # The requests of this attempt are compared with the recorded ones from the first one on.
     requests.restart()
     problem = get_problem(experiment)
     target = request.target
@@ -281,6 +288,6 @@ def make_unfinished_outcome(
         reason: reason of the status.
     """
     trace = RunTrace.make_unfinished(status, reason, target.start)
-    # The errors have one row, for the start, which was not simulated.
+    # The errors (1, C) have one row, for the start, which was not simulated.
     unknown_errors = np.full((1, len(problem.channels)), np.nan)
     return RunOutcome(trace, obs_rmse=unknown_errors, heldout_rmse=None, seconds=0.0)

@@ -60,7 +60,7 @@ def build_rows(
             that the data determine well and badly.
 
     Returns:
-        Values by column name.
+        Values by column name, each column with one value per row.
     """
     trace = outcome.trace
     simulations = len(trace.losses)

@@ -141,6 +141,9 @@ class Study(ABC):
     def finish(self, run_missing: Callable[[], None]) -> StudyOutcome:
         """Run what is missing, and return how far the study came, also if it was interrupted.
 
+        It can end early by an interrupt of the user, or because the cluster is lost; the outcome
+        says so. A complete study reveals its salt.
+
         Args:
             run_missing: runs and stores everything that is missing.
         """

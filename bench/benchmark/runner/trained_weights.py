@@ -90,7 +90,10 @@ def write_weights(
 
 
 def read_weights(path: Path) -> dict[str, Array]:
-    """Read the weights of a file.
+    """Read the weights of a file, without the cost of the training and its key.
+
+    Returns:
+        Arrays by name.
 
     Raises:
         WeightsError: the file is missing, damaged, or of another training.

@@ -143,8 +143,14 @@ def _train_or_read_weights(
         request: names the tuner's entry and the seed, and how to build the tuner in isolation.
         callback: gets the losses of each epoch.
         trains_anew: train even if the cache has the weights.
-        requests: simulations that were requested before an external kill.
+        requests: simulations that were requested before an external kill; a repetition must
+            request the same.
+
+    Returns:
+        File of the weights and cost of the training; for weights of the cache the cost that is
+        stored with them.
     """
+    # The requests of this attempt are compared with the recorded ones from the first one on.
     requests.restart()
     entry, seed = request.entry, request.seed
     training_key = compute_training_key(experiment, entry, seed)

@@ -507,6 +507,7 @@ class _WorkerSlot:
         for future in [future for future in self.assigned_calls if future.done()]:
             call, error = self.assigned_calls.pop(future), future.exception()
             is_lost = is_lost or _loses_the_worker(error)
+            # A result shows that this worker works.
             if error is None:
                 self._failed_restarts = 0
             if _should_retry(call, error):
@@ -523,6 +524,7 @@ class _WorkerSlot:
                 (self.assigned_calls.pop(running), WorkerDiedError(_describe_worker_exit(0)))
             )
         if is_lost:
+            # A call that has ended, even by an error, shows that the worker had started properly.
             self._failed_restarts = 0 if ended_calls else self._failed_restarts
             # `extendleft` reverses the order, so the calls are reversed before.
             waiting.extendleft(reversed(self.assigned_calls.values()))
@@ -580,6 +582,7 @@ def _should_retry(call: _AssignedCall, error: BaseException | None) -> bool:
         call: the call, whose number of deaths is increased in place.
         error: error with which it ended; None if it has a result.
     """
+    # None unless the worker died during the call.
     code = _get_exit_code(error)
     is_repeated = isinstance(error, BrokenExecutor) or (
         code in _EXTERNAL_KILL_EXIT_CODES and call.deaths < MAX_RETRIES

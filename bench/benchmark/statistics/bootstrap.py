@@ -40,7 +40,8 @@ def compute_bootstrap_interval(
     the interval contains 95 % of these values.
 
     Args:
-        values: (n, m) measured values, one row per target; rows that are not finite are left out.
+        values: (n, m) measured values, one row per target, one column per number of simulations;
+            rows that are not finite are left out.
         statistic: `compute_resampled_means` or `compute_resampled_medians`.
         names: names that determine the random stream of the bootstrap.
         resamples: number of resamples.
@@ -110,7 +111,8 @@ def compute_resampled_medians(values: Array, counts: ResampleCounts) -> Array:
         order = np.argsort(column)
         cumulative_counts = np.cumsum(counts[order], axis=0, dtype=counts.dtype)
         # With k counted from 0, the k-th smallest value of a resample is the first sorted value
-        # whose cumulative count is larger than k.
+        # whose cumulative count is larger than k. Its index is the
+        # number of cumulative counts that are not larger than k.
         lower, upper = (
             np.add.reduce(cumulative_counts <= k, axis=0, dtype=counts.dtype)
             for k in ((n - 1) // 2, n // 2)

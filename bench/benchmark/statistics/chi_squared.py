@@ -39,6 +39,7 @@ def chi_squared_tail(freedom: int, statistic: float) -> float:
     # above 745.
     terms = [
         exp((i - half_remainder) * log(h) - lgamma(i - half_remainder + 1.0) - h)
+        # From 0 to k/2 - 1 for even k, and from 1 to (k-1)/2 for odd k.
         for i in range(1 if half_remainder else 0, (freedom + 1) // 2)
     ]
     return min(1.0, fsum([erfc(sqrt(h)) if half_remainder else 0.0, *terms]))

@@ -94,7 +94,8 @@ class ComparisonStatistics:
         self.floor = stored.experiment.negligible_error
         if not in_widths:
             # A recording has errors that no parameters could remove, so tuners that are close to
-            # the smallest median error count as equal.
+            # the smallest median error count as equal. The
+            # experiment's negligible error is then a share of this smallest one.
             self.floor = (1.0 + self.floor) * _find_lowest_median(self.curves)
         self.all_runs = stored.runs
         self._curves: dict[str, RunCurves] = {}
@@ -137,6 +138,9 @@ class ComparisonStatistics:
 
         Args:
             frame: Table with the columns `range` and `tuner`.
+
+        Returns:
+            The sorted table with a new index.
         """
         kinds = [str(kind) for kind in dict.fromkeys(self._all_runs.keys["range"])]
         order = [(kind, tuner) for kind in kinds for tuner in self.order_in(kind)]
@@ -187,7 +191,8 @@ class ComparisonStatistics:
     def unit(self) -> float:
         """Factor that converts the floor and the medians to the unit of the single parameter.
 
-        It is 1 if there are several parameters, or none whose true value is known.
+        They are in widths of the training range, so the factor is this width. It is 1
+        if there are several parameters, or none whose true value is known.
         """
         if self.metric != "param_error" or "param_abs_error" not in self.runs:
             return 1.0
@@ -266,12 +271,15 @@ class ComparisonStatistics:
         }
 
     def _compute_tuning_costs(self, level: float) -> dict[str, dict[str, TuningCost]]:
-        """Compute what each tuner costs to reach an error threshold, by range and then by tuner.
+        """Compute what each tuner costs to reach an error threshold.
 
         Costs are the simulations, the seconds in the tuner and in the simulator, and the training.
 
         Args:
             level: error threshold of the deciding metric.
+
+        Returns:
+            Cost by range, and then by tuner.
         """
         in_tuner = self._rows.build_cumulative_seconds("tuner_seconds")
         in_simulator = self._rows.build_cumulative_seconds("simulator_seconds")

@@ -158,9 +158,9 @@ class RunRowTable:
     def __init__(self, runs: pd.DataFrame, statuses: pd.DataFrame, budget: int) -> None:
         """Assign a matrix row to every run, and a matrix column to every number of simulations k.
 
-        For R runs: `_codes` is the matrix row of each table row, `keys` (R rows) has tuner, target
-        and seed, `used` (R,) is the last k of each run, and `failed` (R,) marks runs with a failed
-        status.
+        The table has one row for each run and k. `_matrix_rows` and `_k` are the matrix row and
+        column of each table row. For R runs: `keys` (R rows) has tuner, target and seed, `used`
+        (R,) is the last k of each run, and `failed` (R,) marks runs with a failed status.
 
         Args:
             runs: rows with at least the columns `RUN_KEY_COLUMNS`, k and the metrics.
@@ -169,17 +169,18 @@ class RunRowTable:
         """
         self._runs, self._budget = runs, budget
         # The matrices of all metrics use the same row and column indices.
-        codes, names = pd.factorize(runs["run"])
-        self._codes, self._k = codes, runs["k"].to_numpy(dtype=np.int64)
+        matrix_rows, names = pd.factorize(runs["run"])
+        self._matrix_rows, self._k = matrix_rows, runs["k"].to_numpy(dtype=np.int64)
         # Table row at which each run begins. It is assigned in reverse order, so that the first row
         # of each run remains.
         first = np.zeros(len(names), dtype=np.int64)
-        first[codes[::-1]] = np.arange(len(codes))[::-1]
+        first[matrix_rows[::-1]] = np.arange(len(matrix_rows))[::-1]
         self.keys = (
             runs[[c for c in RUN_KEY_COLUMNS if c in runs]].iloc[first].reset_index(drop=True)
         )
+        # The largest k among the table rows of each run.
         self.used = np.zeros(len(names), dtype=np.int64)
-        np.maximum.at(self.used, codes, self._k)
+        np.maximum.at(self.used, matrix_rows, self._k)
         failed_runs = set(statuses.loc[statuses["status"].isin(FAILED_STATUSES), "run"])
         self.failed = self.keys["run"].isin(failed_runs).to_numpy(dtype=bool)
 
@@ -195,13 +196,18 @@ class RunRowTable:
         values = np.full((len(self.keys), self._budget + 1), np.nan)
         is_within_budget = self._k <= self._budget
         column = self._runs[name].to_numpy(dtype=np.float64)
-        values[self._codes[is_within_budget], self._k[is_within_budget]] = column[is_within_budget]
+        rows, columns = self._matrix_rows[is_within_budget], self._k[is_within_budget]
+        values[rows, columns] = column[is_within_budget]
         return values
 
     def build_curves(self, metric: str) -> RunCurves:
-        """Build the curves of a metric; a run that ended early keeps its last value."""
+        """Build the curves of a metric; a run that ended early keeps its last value.
+
+        Args:
+            metric: column of the table, such as "param_error".
+        """
         values = self.build_matrix(metric)
-        # After the end of a run, its last recommendation is used.
+        # Matrix column from which each value is taken: k, or the last k of a run that has ended.
         last = np.minimum(self.used, self._budget)[:, None]
         columns = np.minimum(np.arange(self._budget + 1)[None], last)
         return RunCurves(
@@ -210,6 +216,9 @@ class RunRowTable:
 
     def build_cumulative_seconds(self, name: str) -> Array:
         """Compute the cumulative seconds of a column.
+
+        Args:
+            name: Column of the table with the seconds of each simulation, such as "tuner_seconds".
 
         Returns:
             (R, budget + 1) seconds summed over the simulations so far.
@@ -228,6 +237,7 @@ def average_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Ar
         (targets, ...) means; NaN where all values of a target are NaN.
     """
     target_means = np.empty((len(groups), *values.shape[1:]))
+    # Number of runs of each target.
     counts = np.array([len(run_rows) for run_rows in groups])
     with warnings.catch_warnings():
         # NumPy warns about the mean of NaN alone; the result NaN is intended.
@@ -337,7 +347,9 @@ def build_error_table(
         trainings: simulations and seconds of one training, by tuner.
 
     Returns:
-        Table with the columns `ERROR_TABLE_COLUMNS`.
+        Table with the columns `ERROR_TABLE_COLUMNS`. `fit_simulations` and `fit_seconds` are the
+        costs of one training; `tuner_seconds` and `simulator_seconds` are the mean seconds of a run
+        up to this number of simulations, NaN if `runs` has no times.
     """
     points = select_checkpoints(budget)
     rows = RunRowTable(runs, statuses, budget)
@@ -358,6 +370,7 @@ def build_error_table(
             np.full(len(points), np.nan) if s is None else s[is_part][:, points].mean(axis=0)
             for s in spent_seconds
         )
+        # Numbers of runs and of failed runs.
         counts = len(part), int(rows.failed[is_part].sum())
         for metric, curve in curves.items():
             values = _summarise_over_targets(
@@ -380,7 +393,9 @@ def build_error_table(
 def _summarise_over_targets(
     curves: RunCurves, points: list[int], names: tuple[str, str, str]
 ) -> Array:
-    """Compute median, mean, low and high over targets.
+    """Compute median and mean over targets, and the bootstrap interval of the mean.
+
+    The value of a target is the mean over its seeds.
 
     Args:
         curves: values of the runs.
@@ -388,7 +403,7 @@ def _summarise_over_targets(
         names: names that determine the stream of the bootstrap.
 
     Returns:
-        (4, len(points)) values.
+        (4, len(points)) values: median, mean, and lower and upper bound of the 95 % interval.
     """
     values = _get_values(compute_target_curves(curves, points))
     low, high = compute_bootstrap_interval(values, compute_resampled_means, *names)
@@ -490,7 +505,8 @@ def compute_medians_by_distance(
 
     Args:
         curves: error of the runs in the range `wide`.
-        distances: distance of each target from the training range, by target name.
+        distances: distance of each target from the training range in widths of this range, by
+            target name; 0 inside.
         budget: largest number of simulations.
 
     Returns:
@@ -540,9 +556,10 @@ def _group_by_distance(distances: pd.Series[float]) -> dict[int, list[str]]:
         Names of the targets by number of the group.
     """
     names_inside = list(distances.index[distances <= 0])
-    outside = list(distances[distances > 0].sort_values(kind="stable").index)
-    count = min(max(len(outside) // _MIN_GROUP_SIZE, 1), _MAX_GROUPS)
-    parts = [list(part) for part in np.array_split(np.array(outside, dtype=object), count)]
+    names_outside = list(distances[distances > 0].sort_values(kind="stable").index)
+    # As many groups of the minimum size as there are, but at least one.
+    count = min(max(len(names_outside) // _MIN_GROUP_SIZE, 1), _MAX_GROUPS)
+    parts = [list(part) for part in np.array_split(np.array(names_outside, dtype=object), count)]
     return {group: names for group, names in enumerate([names_inside, *parts]) if names}
 
 

@@ -53,7 +53,7 @@ def select_thresholds(curves: RunCurves, simulated: bool) -> tuple[Array, tuple[
     best = min(float(np.nanmin(curves.compute_final_values())), 0.5 * start)
     # Slightly above the smallest error, so that the best run reaches it despite rounding.
     thresholds = np.geomspace(start, 1.001 * best, 21)
-    # The table has five of them, more of the tight ones.
+    # The table has five of the 21 thresholds, more of the tight (last) ones.
     return thresholds, tuple(float(x) for x in thresholds[[5, 10, 15, 18, 20]])
 
 
@@ -73,7 +73,8 @@ def compute_hitting_times(curves: RunCurves, threshold: float) -> Array:
     # The comparison is negated, so that NaN counts as above the threshold.
     is_above = ~(curves.values <= threshold)
     steps = is_above.shape[1]
-    # Index after the last value above the threshold; 0 if no value is above it.
+    # Index after the last value above the threshold; 0 if no value is above it. If even the last
+    # value is above it, the index is `steps`, beyond the end.
     last = steps - np.argmax(is_above[:, ::-1], axis=1)
     last = np.where(is_above.any(axis=1), last, 0)
     return np.where((last >= steps) | curves.failed, np.inf, last.astype(np.float64))
@@ -147,6 +148,10 @@ def compute_effort(
         budget: number of simulations that a failed run counts with.
         tuner_seconds: (R, K + 1) cumulative seconds in the tuner of R runs after 0 to K
             simulations; None if they are not needed.
+
+    Returns:
+        Simulations, seconds and successes of each target, in the sorted order of target names; the
+        seconds are 0 without `tuner_seconds`.
     """
     times = compute_hitting_times(curves, threshold)
     success = np.isfinite(times)
@@ -233,7 +238,7 @@ def compute_solved_fraction(
         points: (P,) numbers of simulations.
 
     Returns:
-        (P,) shares.
+        (P,) shares of the pairs that are reached after at most this number of simulations.
     """
     times = np.concatenate([compute_hitting_times(curves, float(t)) for t in thresholds])
     return np.array([(times <= k).mean() for k in points])
@@ -267,7 +272,8 @@ def build_runtime_table(curves: RunCurves, thresholds: Array) -> pd.DataFrame:
 def compute_runtime_shares(curves: RunCurves, thresholds: Array) -> list[dict[str, Array]]:
     """Compute the share of thresholds that each tuner has reached after 0..100 % of the budget.
 
-    Problems have different budgets, so shares of it make them comparable.
+    Problems have different budgets, so shares of it make them comparable. A pair of run and
+    threshold counts as reached if the error of the run stays at or below the threshold.
 
     Args:
         curves: errors of all runs of one comparison.

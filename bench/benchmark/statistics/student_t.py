@@ -23,6 +23,8 @@ def student_p_value(size: float, freedom: int) -> float:
     """
     angle = atan(size / sqrt(freedom))
     is_odd = freedom % 2
+    # First term of the series: sin a in (1), sin a cos a in (2). The loop adds one term in each
+    # turn, and multiplies it by the ratio to the next one; with k = 1 there is none.
     term = sin(angle) * (cos(angle) if is_odd else 1.0)
     series_sum = 0.0
     for factor in range(1 + is_odd, freedom, 2):

@@ -160,20 +160,21 @@ def compute_break_even_targets(
     Args:
         learned: cost of the learned tuner.
         search: cost of the search tuner.
-        picked: (..., n) indices of the targets that are used; None for all targets.
+        picked: (..., n) indices of the targets whose effort gives the ERT, such as bootstrap
+            resamples; None for all targets.
 
     Returns:
-        Number of targets; 0 where the search tuner never reaches the threshold, infinite where
-        training never pays.
+        (...) numbers of targets; 0 where the search tuner never reaches the threshold, infinite
+        where training never pays.
     """
+    learned_never_succeeds = np.isinf(learned.effort.compute_ert(picked))
     # Solved for n: fit / (ert_search - ert_learned). If the search tuner never reaches the
     # threshold, its ERT is infinite, and n is 0.
-    never_succeeds = np.isinf(learned.effort.compute_ert(picked))
     # Training never pays if the saving is not positive, or NaN because both tuners fail.
     with np.errstate(invalid="ignore", divide="ignore"):
         saving = search.effort.compute_ert(picked) - learned.effort.compute_ert(picked)
         result: Array = np.where(
-            never_succeeds | ~(saving > 0), np.inf, learned.fit_simulations / saving
+            learned_never_succeeds | ~(saving > 0), np.inf, learned.fit_simulations / saving
         )
     return result
 
@@ -259,7 +260,8 @@ def find_cheapest_tuners(
 ) -> list[tuple[float, float, str]]:
     """Find the fastest tuner for each duration of one simulation.
 
-    Slow simulations favour tuners that need few of them, fast ones tuners that think little.
+    The durations are those of `SIMULATION_COST_GRID`. Slow simulations favour tuners that need few
+    of them, fast simulations favour tuners whose own computations are fast.
 
     Args:
         costs_by_tuner: cost by tuner.
@@ -356,6 +358,9 @@ def map_break_even_counts(table: pd.DataFrame) -> pd.DataFrame:
 
     Args:
         table: Counts of targets after which a training has paid, with intervals.
+
+    Returns:
+        The table with the mapped columns `targets`, `low` and `high`.
     """
     mapped_table = table.copy()
     for column in ("targets", "low", "high"):

@@ -64,8 +64,8 @@ SIGNIFICANCE = 0.05
 """Holm-corrected p-value below which a tuner is called worse than the best one."""
 _RANKED_AFTER = (1, 3, 10)
 """Numbers of simulations after which tuners are ranked, in addition to the whole budget."""
-_NO_ERROR = 100.0
-"""Threshold of log error; larger values are the number that represents a failed run."""
+_MAX_LOG_ERROR = 100.0
+"""Upper limit of the logarithm of a real error; larger values represent a failed run."""
 BEST, EQUAL, UNDECIDED, WORSE, FAILED = "best", "equal", "not decided", "worse", "failed"
 """Verdicts on a tuner.
 
@@ -160,6 +160,7 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
     Returns:
         Rankings by number of simulations.
     """
+    # True for a tuner whose runs all failed; it comes last.
     has_failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
     rankings: dict[int, _Ranking] = {}
     earlier_ranks: list[pd.Series[float]] = []
@@ -168,6 +169,8 @@ def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int,
         # Rounding gives errors that differ by the last bits the same rank.
         medians, mean_logs = logs.median().round(9), logs.mean().round(9)
         ranks = medians.rank(method="min")
+        # Each key has a number for every tuner; a later key decides among tuners that are equal by
+        # all earlier ones.
         keys = [pd.Series(has_failed), medians, mean_logs, *reversed(earlier_ranks)]
         order = sorted(logs.columns, key=lambda t: [float(key[t]) for key in keys])
         rankings[simulations] = _Ranking(logs, ranks, order)
@@ -180,22 +183,24 @@ def _build_verdict_rows(
 ) -> pd.DataFrame:
     """Build the rows of one ranking, with each tuner tested against the best.
 
-    The best is the first tuner that has a successful run. The test is Wilcoxon's signed-rank test
-    over targets with Holm's correction for several tests. A tuner is WORSE if the difference is
-    significant, EQUAL if it shares the first rank, FAILED if all its runs failed, and otherwise
-    UNDECIDED.
+    The first tuner that has a successful run is BEST. Each other one is tested against it, by
+    Wilcoxon's signed-rank test over targets with Holm's correction for several tests. It is WORSE
+    if its errors are significantly larger, otherwise EQUAL if it has the same rank as the best, and
+    else UNDECIDED. A tuner whose runs all failed is FAILED and is not tested.
 
     Args:
-        ranking: tuners in the order of their median errors.
-        curves: errors of each run over the number of simulations.
+        ranking: order of the tuners, their ranks, and the logarithms of their errors by target.
+        curves: errors of each run over the number of simulations; gives the counts of runs and
+            failures.
         key: first columns of each row: experiment, range and number of simulations.
 
     Returns:
         One row per tuner, in the order of the ranking, columns `RANKING_COLUMNS`.
     """
     logs, ranks, order = ranking
-    runs = {t: curves.select(tuner=t).failed for t in order}
-    successful_tuners = [t for t in order if not runs[t].all()]
+    # A mask of each tuner's runs, True for a failed run.
+    is_failed = {t: curves.select(tuner=t).failed for t in order}
+    successful_tuners = [t for t in order if not is_failed[t].all()]
     best = successful_tuners[0] if successful_tuners else order[0]
     tests = {t: compare_pair(logs[t].to_numpy(), logs[best].to_numpy()) for t in order}
     other_tuners = [t for t in successful_tuners if t != best]
@@ -208,7 +213,7 @@ def _build_verdict_rows(
     )
     lines = []
     for tuner in order:
-        # Without a test, as for the best tuner itself, the p-value is NaN.
+        # The best tuner and those without a successful run are not tested; their p-values are NaN.
         test, p_holm = tests[tuner], corrected.get(tuner, np.nan)
         if tuner not in successful_tuners:
             verdict = FAILED
@@ -230,7 +235,7 @@ def _build_verdict_rows(
             p_value,
             p_holm,
         )
-        counts = len(runs[tuner]), int(runs[tuner].sum())
+        counts = len(is_failed[tuner]), int(is_failed[tuner].sum())
         lines.append((*key, int(ranks[tuner]), tuner, verdict, *test_cells, *counts))
     return pd.DataFrame(lines, columns=RANKING_COLUMNS)
 
@@ -239,10 +244,11 @@ def _compute_median_error(logs: pd.Series[float]) -> float:
     """Return the median error over targets; infinite if half of the targets failed.
 
     Args:
-        logs: logarithms of the errors; a failed target has a number above `_NO_ERROR`.
+        logs: logarithms of the errors, one for each target; a target on which the tuner failed has
+            a large number instead. A median above `_MAX_LOG_ERROR` comes from such numbers.
     """
-    middle = float(logs.median())
-    return float(np.exp(middle)) if middle < _NO_ERROR else np.inf
+    median_log = float(logs.median())
+    return float(np.exp(median_log)) if median_log < _MAX_LOG_ERROR else np.inf
 
 
 def compute_problem_ranks(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFrame:
@@ -309,8 +315,10 @@ def compute_friedman_p_value(errors: Array) -> float:
     targets, tuners = errors.shape
     if targets < MIN_PROBLEMS_FOR_RANKS or tuners < 3:
         return float("nan")
-    worst = np.where(np.isfinite(errors), errors, np.inf)
-    return float(friedmanchisquare(*np.log(np.maximum(worst, MIN_ERROR)).round(9).T).pvalue)
+    # An infinite error has the worst rank.
+    ranked_errors = np.where(np.isfinite(errors), errors, np.inf)
+    log_errors = np.log(np.maximum(ranked_errors, MIN_ERROR)).round(9)
+    return float(friedmanchisquare(*log_errors.T).pvalue)
 
 
 @dataclass(frozen=True)
@@ -345,7 +353,12 @@ def compute_mean_ranks(errors: Array) -> Array:
 
 
 def _rank_within_targets(errors: Array) -> Array:
-    """Compute ranks (targets, tuners) within each target; equal errors share one."""
+    """Compute each tuner's rank within each target from errors (targets, tuners).
+
+    Returns:
+        (targets, tuners) ranks, 1 for the smallest error. Equal errors share their mean rank; a NaN
+        or infinite error has the last rank.
+    """
     from scipy.stats import rankdata
 
     # Rounded logarithms give errors that differ by the last bit the same rank.
@@ -385,7 +398,9 @@ def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgre
         names: names of the comparison, which determine the random stream.
 
     Returns:
-        Tau with its interval and p-value, and tau between halves of the targets for comparison.
+        Tau with its 95 % interval and p-value, and the mean tau between two halves of the targets
+        in the first condition: the agreement that can be expected from a change of targets alone.
+        The interval is NaN with a single target.
     """
     rng = make_rng("agreement", *names)
     # The shape is (2, targets, tuners).
@@ -397,6 +412,7 @@ def compute_rank_agreement(first: Array, second: Array, *names: str) -> RankAgre
     resampled_taus = [compute_kendall_tau(*ranks[:, rows].mean(axis=1)) for rows in resamples]
     low, high = (np.nan, np.nan)
     if count > 1:
+        # Tau is NaN for a resample in which all tuners have the same mean rank in one condition.
         low, high = np.nanquantile(resampled_taus, INTERVAL_QUANTILES)
     # Targets that are drawn twice make ranks noisier, and noise moves tau towards 0. The interval
     # is extended to the observed tau.

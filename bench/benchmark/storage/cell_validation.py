@@ -50,6 +50,9 @@ def select_declared_columns(
         columns: Declared columns.
         row: Row for the error message; None for a table.
 
+    Returns:
+        Declarations of these columns, in the order of `columns`; undeclared columns are ignored.
+
     Raises:
         CellError: A required column is missing, or a column occurs twice.
     """
@@ -210,6 +213,8 @@ def check_cells(
     if not column.infinite:
         exceeds_limits |= np.isinf(numbers)
     _raise_for_bad_row(column, exceeds_limits, format_cell)
+    # Mask of the rows whose cell must be empty, by the rule of the column. The two checks below
+    # compare it with the cells that are empty.
     must_be_empty = {
         EmptyCellRule.NEVER: np.zeros(len(numbers), dtype=bool),
         EmptyCellRule.MAY: empty,  # Whatever is empty may be so.

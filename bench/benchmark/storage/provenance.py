@@ -119,6 +119,7 @@ def write_explanation_environment(
         "recordings": [
             {"file": path.name, "sha256": compute_sha256(path)}
             for table in recordings
+            # Without duplicates, since a "table" may itself be a .toml file.
             for path in dict.fromkeys([table, table.with_suffix(".toml")])
             if path.is_file()
         ],

@@ -93,7 +93,12 @@ class ReferenceResult:
     def find_mismatches(self, experiment: Experiment) -> list[str]:
         """List the differences from an experiment that is drawn over it, one line each.
 
-        The reference is drawn in grey behind the results of the experiment.
+        The reference is drawn in grey behind the results of the experiment. Keys that define the
+        problem, such as the simulator, must be equal; differences of other settings, such as the
+        budget, are allowed and listed.
+
+        Args:
+            experiment: Experiment that is drawn over the reference.
 
         Raises:
             InputError: It is of another problem, so the errors are not comparable.

@@ -75,7 +75,8 @@ def check_files(
 ) -> CheckedFiles:
     """Check runs.parquet, status.csv, training.csv, identifiability.csv and their consistency.
 
-    The tables are checked alone first, then against each other and against the plan of runs.
+    The tables are checked alone first, then against each other and against the plan, the list of
+    all runs. A tuner that could not be used is skipped: it has a row in status.csv, but no runs.
 
     Args:
         folder: Folder of the comparison.
@@ -106,6 +107,7 @@ def check_files(
         is_planned = executed["run"].isin(plan)
         raise_for_first_bad_row(
             ~is_planned,
+            # `i` counts the executed runs only; the index is the row in the file.
             lambda i, reason: status.make_error(int(executed.index[i]), reason),
             lambda i: f"run: expected one of segments/plan.txt, found {executed['run'].iloc[i]}",
         )
@@ -154,6 +156,17 @@ def _read_identifiability_table(
 
     The file has the directions of the parameter space of each target, in order of number. Targets
     must be those of the experiment, and the directions of a target must be numbered 1, 2, ....
+
+    Args:
+        folder: Folder of the comparison.
+        experiment: Content of the experiment's TOML file: simulator, tuners, targets and budget.
+        remedy: Advice for a damaged file.
+
+    Returns:
+        Rows of the file.
+
+    Raises:
+        InputError: The file is damaged.
     """
     path = folder / "identifiability.csv"
     if not path.exists():
@@ -247,7 +260,8 @@ def _read_checked_runs(
 ) -> pd.DataFrame:
     """Check rows of runs and return one line per run; see `RunsTable.read_runs`.
 
-    A run has one row for each number of simulations k, in consecutive rows.
+    A run has one row for each number of simulations k, in consecutive rows. The columns that
+    describe the run itself, such as tuner and target, must be constant within these rows.
 
     Args:
         read_columns: Reads columns by their names.
@@ -282,8 +296,10 @@ def _read_checked_runs(
     constants = {"run": run.take(rows)}
     for name, column in declared.items():
         values = read(name)
+        # Some columns must be empty at k = 0, others for a recording.
         check_cells(column, values, k == 0, is_recording)
         if name in RUN_CONSTANT_COLUMNS or name.startswith("true_"):
+            # A row that does not start a run belongs to the same run as the row before.
             _check_constant(name, values, ~is_run_start[1:])
             constants[name] = values.take(rows)
     # k counts without gaps, so the number of rows gives the last k.
@@ -312,6 +328,11 @@ def _find_changes(values: pa.Array) -> Mask:
 
 def _check_counts(run: pa.Array, k: NDArray[np.int64], is_run_start: Mask) -> None:
     """Check that k, the number of simulations, counts 0, 1, 2, ... in the rows of every run.
+
+    Args:
+        run: (n,) id of the run of each row.
+        k: (n,) number of simulations of each row.
+        is_run_start: (n,) mask of the rows with which a run begins.
 
     Raises:
         CellError: k has another value, so that a row is missing or added.
@@ -414,12 +435,14 @@ def check_complete(
         if tuner_rows.empty:
             continue
         seeds = range(_count_seeds(entry, experiment, tuner_rows["seed"].max()))
+        # Pairs of target and seed that have a run.
         executed = set(zip(tuner_rows["target"], tuner_rows["seed"].tolist(), strict=True))
         missing = next(((t, s) for t in targets for s in seeds if (t, s) not in executed), None)
         if missing:
             target, seed = missing
             problem = f"expected a run of {entry.label} on {target} with seed {seed}, found none"
             raise make_error(None, problem)
+        # Nothing is missing, so a larger number means a repeated run or a seed that is too large.
         if len(tuner_rows) > len(targets) * len(seeds):
             is_surplus = tuner_rows.duplicated(["target", "seed"]) | (
                 tuner_rows["seed"] >= len(seeds)
@@ -433,11 +456,16 @@ def check_complete(
 
 
 def _count_seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int:
-    """Return the number of seeds of an entry; `largest` is the largest seed in its planned runs.
+    """Return the number of seeds that an entry's runs must have.
 
     A deterministic tuner has one seed, whatever the experiment states. If more than one seed
     occurs, the tuner is not deterministic, and need not be loaded to find out. The result equals
     `bench.benchmark.runner.experiment_runner.count_seeds` if the tuner is known.
+
+    Args:
+        entry: Entry of the tuner.
+        experiment: Experiment, whose number of seeds applies unless the entry has its own.
+        largest: Largest seed in the entry's runs; seeds count from 0.
     """
     seed_count = entry.seeds or experiment.seeds
     if seed_count == 1 or largest > 0:
@@ -607,6 +635,7 @@ def check_rows_match_statuses(
         make_error,
         lambda row: f"run: {ids[row]} has no rows in {file.path.name}",
     )
+    # The statuses in the order of `runs`; `used` is the last k of each run.
     run_statuses, used_counts = statuses.iloc[status_rows].reset_index(drop=True), runs["used"]
     raise_for_first_bad_row(
         run_statuses["simulations"] != used_counts,
@@ -655,6 +684,8 @@ def check_journal_statuses(
     plan: Sequence[str] | None,
 ) -> pd.DataFrame:
     """Check the statuses of a journal: its runs must be those of the plan.
+
+    The journal is the file to which an unfinished comparison appends each run that has ended.
 
     Args:
         path: Path of the journal.
@@ -720,8 +751,8 @@ def check_equal(
     """Reject values that differ from the expected ones; two missing values are equal.
 
     Args:
-        found: Values to check.
-        expected: Expected values.
+        found: Values to check, with the index 0, 1, 2, ....
+        expected: Expected values, with the same index.
         name: Name of the column.
         why: Reason for the expected values.
         make_error: Makes the error.
@@ -744,7 +775,7 @@ def raise_for_first_bad_row(
 
     Args:
         bad: Mask of bad rows.
-        make_error: Makes the error.
+        make_error: Makes the error for the position of a row in this mask.
         describe_row: Describes what is wrong in a row.
 
     Raises:

@@ -91,6 +91,9 @@ def create_folder(
 ) -> None:
     """Make the folder with experiment.toml and environment.json, all at once or not at all.
 
+    A secret salt is written to a file that only its owner can read; the file is deleted when the
+    study is complete.
+
     Args:
         folder: Path of a new or empty folder.
         configuration: Its configuration.
@@ -170,6 +173,9 @@ def read_configuration(folder: Path) -> FolderConfiguration:
 
 def read_environment(folder: Path) -> dict[str, Any]:
     """Read and check environment.json; undeclared keys are left out.
+
+    Returns:
+        Values by key, see `ENVIRONMENT_KEYS`: versions, machine, plugin files and hashes.
 
     Raises:
         InputError: It is damaged.
@@ -291,6 +297,7 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
         for name in stored_names
         if columns is None or name in columns or name.startswith(prefixes)
     ]
+    # `check_files` has reduced its rows to one line per run; here all rows are read.
     runs = parquet.read_table(path, columns=read_names).to_pandas()
     # A file without runs has no columns, and none are added.
     return StoredComparison(
@@ -318,7 +325,10 @@ def _add_missing_columns(
 ) -> pd.DataFrame:
     """Add columns that a folder of an older version lacks, filled with their declared default.
 
-    `selected` are the names of the columns to be used; None for all.
+    Args:
+        frame: Table that has been read.
+        declared: Declared columns; those without a default are not added.
+        selected: Names of the columns that are used; None for all.
     """
     missing = {
         column.name: column.default

@@ -72,6 +72,9 @@ def encode_record(plan_index: int, status: RunStatus, rows: pa.Table) -> bytes:
         plan_index: Index of the run in the plan.
         status: How the run ended.
         rows: Rows of the run.
+
+    Returns:
+        Bytes of the record; the header has the lengths and the checksum of status and rows.
     """
     import pyarrow as pa
 
@@ -98,8 +101,10 @@ def decode_rows(packed: bytes) -> pa.Table:
 def read_records(path: Path) -> Iterator[JournalRecord]:
     """Yield every complete record of a journal; none if there is no such file.
 
-    A process that was killed may have left an incomplete record at the end, and a crash of the
-    machine zeros. Reading stops before them.
+    A journal has one record for each finished run: a header with a mark, two lengths and a
+    checksum, the status of the run (head), and its compressed rows. A process that was killed may
+    have left an incomplete record at the end, and a crash of the machine zeros. Reading stops
+    before them.
 
     Raises:
         InputError: a record with others after it is damaged.

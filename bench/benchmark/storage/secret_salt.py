@@ -41,6 +41,7 @@ def draw_salt_if_needed(experiment: Experiment, salt: str | None) -> tuple[Exper
             f"experiment {experiment.name}: states a public salt; leave out the salt, or "
             "remove it from the experiment"
         )
+    # A public salt has no hash, because nothing is committed.
     if experiment.salt or salt == PUBLIC_SALT:
         return experiment.chosen(salt=experiment.salt or PUBLIC_SALT, salt_sha256=""), None
     secret = generate_salt() if salt is None else salt

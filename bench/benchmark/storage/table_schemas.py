@@ -365,8 +365,9 @@ def expand_columns(
 def declare_run_columns(names: list[str], experiment: Experiment) -> list[ColumnSpec]:
     """Return the columns that the runs of an experiment must have, with their types and limits.
 
-    Some columns exist once for each parameter or channel: those that the names of the file's
-    columns contain and those of the experiment. If there are none, these columns keep the
+    Some columns exist once for each parameter or channel. The parameters are those in the names of
+    the file's columns and those that the experiment changes; the channels are those that the
+    experiment observes, or else those in the names. If there are none, these columns keep the
     placeholder PARAMETER or CHANNEL in their names.
 
     Args:

@@ -195,7 +195,7 @@ class ConventionComparison:
         ]
         if copies:
             return copies
-        # The log as its description states it, and as it is corrected so far.
+        # The log with the conventions of its description, and with the corrections so far.
         described = corrected = self.subject.recording
         differences: list[ConventionDifference] = []
         for _ in range(MAX_DIFFERENCES):
@@ -228,8 +228,8 @@ class ConventionComparison:
         so a correction must meet all criteria:
 
         1. It removes most of the missing force (the process noise that the filter needs).
-        2. Its log-likelihood exceeds that of any causes added to the log as described. Both are
-           computed on the segments with the largest movement, which are fast to filter.
+        2. Its log-likelihood exceeds that of the log as described with the best set of causes. Both
+           are computed on the segments with the largest movement, which are fast to filter.
         3. If the filter diverges on the log as described, criterion 2 always holds. Then the
            correction must leave almost no missing force.
         4. It increases the log-likelihood of all samples that both versions of the log have.
@@ -253,7 +253,7 @@ class ConventionComparison:
         with_causes = self._compute_log_likelihood_of_causes(corrected, hypotheses)
         if with_conventions < with_causes + CAUSES_MARGIN:
             return False
-        # 3. Minus infinity: the filter diverged, so causes could not be compared.
+        # 3. Minus infinity: the filter diverged on the log as described.
         if (
             np.isinf(with_causes)
             and self._compute_largest_missing_force(corrected) > MIN_MISSING_FORCE
@@ -278,7 +278,7 @@ class ConventionComparison:
         return after <= MAX_REMAINING_FORCE * before
 
     def _compute_largest_missing_force(self, recording: Recording) -> float:
-        """Return the largest missing force of a joint, relative to its typical force.
+        """Return the largest missing force of a joint or floating body, relative to typical forces.
 
         A missing force is the process noise with which the filter has to follow the readings. It is
         large if a convention is wrong, and infinite if the filter diverges.
@@ -290,7 +290,7 @@ class ConventionComparison:
         # Without expected innovations, the filter does not follow the readings: it diverges.
         if not filtered_runs.has_expected_innovations:
             return np.inf
-        # Missing and typical force of each joint.
+        # Missing and typical force of each joint and each degree of freedom of floating bodies.
         return float((filtered_runs.force / filtered_runs.typical).max())
 
     def _list_suspect_joints(self, filtered_runs: FollowedRuns) -> list[JointSignals]:
@@ -367,7 +367,7 @@ class ConventionComparison:
             hypothesis for score, hypothesis in accepted if score > best - EQUAL_LOG_LIKELIHOOD
         ]
         simplest, *others = sorted(equally_likely, key=lambda hypothesis: hypothesis.size)
-        # The limit contains the margin, and the gain is over the log as described.
+        # The gain is over the log as described, and the limit contains the margin in addition.
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
         return ConventionDifference(simplest, gain, tuple(others[: MAX_NAMED - 1]))
 
@@ -404,17 +404,18 @@ class ConventionComparison:
         force_error = self._compute_log_force_error(described, recording, worst_run)
         best_by_description: dict[str, tuple[float, ConventionHypothesis]] = {}
         evaluated_changes: list[object] = []
-        # An evaluation is one run of the filter.
-        last_evaluation = self.evaluations + MAX_EVALUATIONS
+        # Number of filters at which the comparison ends. Each log-likelihood needs one filter.
+        max_evaluations = self.evaluations + MAX_EVALUATIONS
         for hypothesis in self._generator.generate(recording, suspects):
-            if self.evaluations >= last_evaluation:
+            if self.evaluations >= max_evaluations:
                 break
-            # Several generators may propose one change in different words.
+            # Several generators may propose one change in different words; it is evaluated once.
             key = dict(hypothesis.changes), hypothesis.late
             if key in evaluated_changes:
                 continue
             evaluated_changes.append(key)
-            # 2. Cheap tests. Without forces to compare, the growth is NaN and rejects nothing.
+            # 2. Cheap tests. Without forces to compare, the growth is NaN or minus infinity, and
+            # rejects nothing.
             force_error_growth = (
                 self._compute_log_force_error(hypothesis, recording, worst_run) - force_error
             )
@@ -433,13 +434,13 @@ class ConventionComparison:
     def _compute_log_force_error(
         self, hypothesis: ConventionHypothesis, recording: Recording, run: int
     ) -> float:
-        """Return how much joint forces and drives disagree under a hypothesis (logarithm).
+        """Return how much needed and driven joint forces disagree under a hypothesis (logarithm).
 
         Inverse dynamics of the recorded motion gives the force that each joint needs; the drives
         give another one if a sign or a unit is wrong. This takes less time than a filter. The
         result is the sum over the joints of the logarithm of the RMS difference, on the segment of
         one run. It is minus infinity (no objection) if the forces cannot be computed, or if the
-        hypothesis does not concern positions.
+        hypothesis changes channels other than positions.
 
         Args:
             hypothesis: assumed conventions, such as another sign of a joint.
@@ -457,7 +458,8 @@ class ConventionComparison:
             return -np.inf
         segment = self._select_segments(hypothesis.applied(recording), run)
         forces = compute_joint_forces(robot, segment, segment.runs[0])
-        # Mean square difference of each joint, in N² or (N m)².
+        # Mean square difference of each joint, in N² or (N m)². Half of its logarithm is that of
+        # the RMS; the small force avoids the logarithm of zero.
         squares = np.square(forces.needed - forces.driven).mean(axis=0)
         return float(0.5 * np.log(squares + NEGLIGIBLE_FORCE**2).sum())
 
@@ -580,8 +582,8 @@ class ConventionComparison:
            forces, the regression is inaccurate.
         4. Add single effects that look like one of the hypotheses: the regression may miss them.
         5. Also try soft friction, which has no linear response.
-        6. If the corrected log is not explained either, the larger of regression and filters is
-           used.
+        6. The result of the regression is less accurate than filters. It counts only if the
+           corrections leave a large missing force: then they must exceed both.
 
         Args:
             corrected: Recording with its conventions corrected.
@@ -605,7 +607,8 @@ class ConventionComparison:
         if not filtered.has_expected_innovations:
             evaluator.close()
             return -np.inf
-        # 2. Regression.
+        # 2. Regression on simple effects. Left out are those with many shapes, such as periodic
+        # forces, and those that contain a convention, such as a gain, and would imitate it.
         excluded_effects = MANY_SHAPES | CONVENTION_EFFECTS
         names = [
             name for name in evaluator.library if name.partition("@")[0] not in excluded_effects
@@ -620,13 +623,13 @@ class ConventionComparison:
             theta = evaluator.get_nominal_theta()
             theta[evaluator.get_coefficient_indices(name)] = start
             fitted = _fit_coefficients(filtered.with_parameters(theta), [name], SIMILAR_CAUSE_STEPS)
-            # No penalty: the search distinguishes them better, if the data do.
+            # No penalty: such a cause and the convention can hardly be distinguished here. In case
+            # of doubt the convention is not reported, and the later search for causes decides.
             best = max(best, fitted.log_likelihood)
         # 5. Soft friction.
         best = max(best, _compute_log_likelihood_of_soft_friction(filtered))
         evaluator.close()
-        # 6. Regression, if its result is the larger one. A large missing force means that the
-        # corrected log is not explained.
+        # 6. Regression.
         if self._compute_largest_missing_force(corrected) < LARGE_MISSING_FORCE:
             return best
         return max(best, selected.log_likelihood - penalty)
@@ -741,12 +744,13 @@ def _list_similar_causes(
     for hypothesis in hypotheses:
         if hypothesis.late > 0.0:
             leads = [n for n in evaluator.library if n.partition("@")[0] == "servo.derivative"]
-            # A robot with one servo has no effect of all servos.
+            # An effect of all servos ends with "@*". A robot with one servo has none.
             of_all_servos = [name for name in leads if name.endswith("@*")]
             causes |= dict.fromkeys(of_all_servos or leads, hypothesis.late)
         if not hypothesis.has_free_offset:
             continue
         for name in hypothesis.changes:
+            # A command, `u.ACTUATOR`.
             if name not in coordinates:
                 causes[f"input.bias@{name.removeprefix('u.')}"] = 0.0
                 continue
@@ -830,7 +834,7 @@ def _compute_log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
         followed: Result of the filter without this friction.
     """
     evaluator = followed.evaluator
-    # The first joint is the one at which the filter needs a missing force most.
+    # The joint at which removing the process noise (the missing force) costs most likelihood.
     joint = followed.joints_by_loss[0]
     # Parameters with friction of several sizes.
     thetas = make_soft_friction_models(followed, evaluator.get_nominal_theta(), joint)

@@ -75,7 +75,10 @@ class ConventionHypothesis:
         """Return the recording with its signals in the conventions of the model.
 
         The initial states are dropped if a signal changes, because they were stated in the old
-        convention.
+        convention. If the command time stamps are late, the commands are moved to earlier times.
+
+        Args:
+            recording: recording with the conventions of its description.
         """
         changed = change_signals(recording, self.changes)
         runs = [replace(run, initial={}) if self.changes else run for run in changed.runs]
@@ -178,7 +181,7 @@ class HypothesisGenerator:
 
         Args:
             recording: Recording as read, or with some conventions corrected.
-            suspects: Joints whose own conventions are tested.
+            suspects: Joints that the model follows badly, whose own conventions are tested.
         """
         # 1. The whole log.
         suspects = [joint for joint in suspects if joint.channels]
@@ -228,7 +231,7 @@ class HypothesisGenerator:
             changes: dict[str, SignalChange] = {}
             for joint in limited:
                 assert joint.range is not None
-                # Position in rad or m of a percentage.
+                # Gain and offset that turn a percentage into a position in rad or m.
                 scale = compute_range_scale(*joint.range, from_zero=low == 0.0)
                 for name in (joint.channels["q"], *joint.servo_inputs):
                     # The values were multiplied by the gain of the stated unit, which is undone.
@@ -252,7 +255,8 @@ def _generate_signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
     """
     positions = [joint.channels[q] for q in ("q", "qd") if q in joint.channels]
     groups = [positions, list(joint.inputs)]
-    # The only channel of a joint is in the first group already.
+    # A reversed velocity alone, or torque alone. The only channel of a joint is in the first group
+    # already.
     if len(joint.channels) > 1:
         groups += [[joint.channels[q]] for q in ("qd", "tau") if q in joint.channels]
     for names in groups:
@@ -351,7 +355,7 @@ def _generate_joint_orders(
     Args:
         joints: joints with their signals, in the order of the model.
         recording: the recording, whose commands the positions may follow.
-        suspects: joints whose columns may be exchanged.
+        suspects: joints that the model follows badly; pairs of them are exchanged.
     """
     indices = range(len(joints))
     # Only signals that all joints have can be exchanged between any of them.
@@ -376,6 +380,7 @@ def _generate_joint_orders(
             for run in recording.training()
         )
         orders.append(find_order_by_variance(signals_of_runs, len(joints)))
+    # An order that leaves a joint out does not change it.
     for order in orders:
         exchanged = [
             (joints[index], joints[source]) for index, source in order.items() if index != source
@@ -433,7 +438,7 @@ def _generate_units(
                 {name: SignalChange(name, scale) for name in names},
                 unit=unit,
             )
-    # Encoder ticks.
+    # Encoder ticks. Position zero is at tick 0, or at half a turn.
     if first_signal.si != "rad" or not _are_whole(signals, recording):
         return
     for ticks in TICKS_PER_TURN:

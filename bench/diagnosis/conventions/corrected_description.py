@@ -123,7 +123,8 @@ def _change_scale(
         table["scale"] = _round_value(factor * old_scale)
     if offset or old_offset:
         table["offset"] = _round_value(factor * old_offset + offset / unit_gain)
-    # The command that determines the turns of a wrapped angle, or only that they are missing.
+    # The name of the command that determines the turns of a wrapped angle or, without one, only
+    # that whole turns are missing.
     if change.unwrap:
         table["unwrap"] = change.command or True
     return table
@@ -204,6 +205,7 @@ def write_corrected(
 
     if path.suffix != ".toml":
         raise InputError(f"{path}: expected NAME.toml for the corrected description")
+    # Commands that are copies of measurements, and for which no other column was found.
     unknown = [
         name
         for difference in differences
@@ -222,10 +224,11 @@ def write_corrected(
         content["model"] = os.path.relpath((old_folder / content["model"]).resolve(), new_folder)
     contents: dict[Path, str | bytes] = {path: tomli_w.dumps(content)}
     table = description.with_suffix(".csv")
+    # A table of the same name is found by this name alone, so it gets the new name.
     if table.exists():
         contents[path.with_suffix(".csv")] = table.read_bytes()
     elif new_folder != old_folder:
-        # The description names the files of a log relative to its folder.
+        # Without such a table, the description names the files of a log relative to its folder.
         raise InputError(
             f"{path}: expected a file in {description.parent}, where the log's files are"
         )

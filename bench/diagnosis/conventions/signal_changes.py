@@ -62,8 +62,8 @@ def change_signals(recording: Recording, changes: Mapping[str, SignalChange]) ->
 def _change_run(run: Run, changes: Mapping[str, SignalChange]) -> Run:
     """Return one run with changed signals.
 
-    `run.before` has, by signal name, the stacked pair of time stamps and values recorded before the
-    run; the values are changed like those of the run.
+    `run.before` has, by name of an input, the stacked pair of time stamps and values recorded
+    before the run, if it is a part of a run; the values are changed like those of the run.
 
     Args:
         run: the run.
@@ -80,7 +80,7 @@ def _change_run(run: Run, changes: Mapping[str, SignalChange]) -> Run:
 
         Args:
             values: signals to convert, (T,) by name.
-            source: all signals of the run, from which a changed one may be computed.
+            source: all signals at the same times, from which a changed one may be computed.
         """
         return {
             name: changes[name].applied(source) if name in changes else unchanged

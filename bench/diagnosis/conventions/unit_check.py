@@ -300,6 +300,7 @@ class Subject:
         Returns:
             Channels, then inputs, with declared unit, recorded unit and conversion factors.
         """
+        # Stated unit, gain and separate scale, by name of the signal.
         try:
             conversions = read_stated_columns(self.recording.path, self.kind)
         except InputError:
@@ -387,6 +388,7 @@ def find_wrong_units(
         distinction = _test_distinctness(subject, hypothesis, after, int(is_recorded.sum()))
         if distinction != "none":
             after_by_hypothesis[hypothesis] = after
+        # A parameter may have absorbed the scale of the input, and has then moved to a bound.
         if distinction == "absorbed":
             alternative_texts += _describe_parameters_at_bounds(evaluator, base.fit)
     if not after_by_hypothesis:
@@ -411,6 +413,7 @@ def _make_simplest_error(
             are the other hypotheses.
     """
     max_equal_misfit = MAX_EQUAL_RATIO * min(after_by_hypothesis.values())
+    # The fewest signals first, and a wrong unit before one with an additional factor or sign.
     best, *others = sorted(
         (h for h, after in after_by_hypothesis.items() if after <= max_equal_misfit),
         key=lambda h: (len(h.signals), h.scale != 1.0),
@@ -466,7 +469,8 @@ def find_imitated_unit(
         signal_name = evaluator.simulator.system.reading(evaluator.channels)
     signal = next((s for s in signals if s.name == signal_name), signals[0])
     # 2. Units.
-    # A sensor gain multiplies the true value, an input gain the commanded value.
+    # Factor by which the recorded values have to be multiplied. The reading is the gain times the
+    # true value, so the gain is undone; the actual input is the gain times the recorded one.
     factor = 1.0 / gain if kind == "channels" else gain
     alternatives = _describe_parameters_at_bounds(evaluator, base)
     for hypothesis in _generate_unit_hypotheses((signal,)):
@@ -510,7 +514,8 @@ def _get_unit_gain(signal: DescribedSignal, unit: str) -> float:
 def _describe_parameters_at_bounds(evaluator: RunEvaluator, fit: TrajectoryFit) -> tuple[str, ...]:
     """Return a clause for each parameter whose value in the base fit is at a bound of its range.
 
-    Such a clause is stated as an alternative explanation of the misfit.
+    Such a clause is stated as an alternative explanation of the misfit: the right value may lie
+    outside the range.
 
     Args:
         evaluator: the runs, with the bounds of the parameters.
@@ -582,7 +587,7 @@ def _list_suspected_parts(evaluator: RunEvaluator, shares: Array) -> frozenset[s
     if not evaluator.kind.has_model:
         return None
     worst_channels = np.argsort(-shares)[:CHECKED_CHANNELS].tolist()
-    # A channel is named after its joint, such as `q.elbow`.
+    # A channel is named after its joint, such as `q.elbow`: the part after the point.
     joints = {evaluator.channels[channel].partition(".")[2] for channel in worst_channels}
     kind: Any = evaluator.kind
     actuators = {actuator.name for actuator in kind.robot.actuators if actuator.joint in joints}
@@ -628,7 +633,7 @@ def _generate_hypotheses(
                     changed_signals, tuple(actual_units[s.si] for s in changed_signals)
                 )
         # If the log was converted from this system twice, all signals have the same wrong factor,
-        # which is that of the first one: the units of a system differ by one factor.
+        # which is that of the first one: deg, deg/s and deg/s^2 have one factor to their SI units.
         if len({s.si for s in related_signals}) > 1:
             si = related_signals[0].si
             specified_units = tuple(s.specified_unit for s in related_signals)
@@ -780,9 +785,10 @@ def _fit_rescaled(
 def _compute_max_cost(evaluator: RunEvaluator, noise: NoiseModel, max_rms: float) -> float:
     """Return the largest cost (sum of squared residuals in units of the noise) of a useful fit.
 
-    A fit with a larger cost explains the recording too badly, and need not be finished. Two limits
-    apply, and the smaller one is returned: that of the RMS residual of all channels together, and
-    the sum of the limits of all channels, which is infinite if a channel hardly moves.
+    A fit with a larger cost explains the recording too badly, and need not be finished. The result
+    is the smaller one of two limits: that of the RMS residual of all channels together, and the sum
+    of the limits of all channels, which is infinite if a channel hardly moves, because such a
+    channel has no limit.
 
     Args:
         evaluator: Run evaluator of the rescaled recording.
@@ -808,9 +814,10 @@ def _test_distinctness(
 ) -> Literal["sharp", "absorbed", "none"]:
     """Test whether a hypothesis fits clearly better than nearby factors.
 
-    A wrong unit has one exact factor k. If other factors fit as well, the misfit has another
-    reason. With the RMS residual e(k), the condition is e(k) < e(k / s) and e(k) < e(k s), with the
-    step s = `FACTOR_STEP`. The tests are:
+    The hypothesis is that signals have another unit or sign, so that their values have to be
+    multiplied by a factor k. A wrong unit has one exact factor k. If other factors fit as well, the
+    misfit has another reason. With the RMS residual e(k), the condition is e(k) < e(k / s) and e(k)
+    < e(k s), with the step s = `FACTOR_STEP`. The tests are:
 
     1. A reversed sign has no nearby factors.
     2. A factor within 4 % of k that fits much better means a gain error.
@@ -821,7 +828,7 @@ def _test_distinctness(
         subject: Recording and simulator to check.
         hypothesis: Hypothesis to test.
         after: RMS residual with the hypothesis, in units of the noise.
-        samples: Number of samples.
+        samples: Number of recorded values of all channels.
 
     Returns:
         ``sharp`` if no nearby factor fits as well; ``absorbed`` if parameters absorb the scale of
@@ -850,12 +857,14 @@ def _test_distinctness(
     nearby_residual = min(
         residual_with_factor(1.0 / FACTOR_STEP), residual_with_factor(FACTOR_STEP)
     )
-    # Twice the log-likelihood of white noise is -n log(RMS residual squared), up to a constant.
+    # Gain in twice the log-likelihood, which for white noise is -n log(RMS residual squared), up to
+    # a constant.
     gain = 2.0 * samples * math.log(nearby_residual / after)
     if gain > MIN_DISTINCT_GAIN:
         return "sharp"
-    # 4. Absorbed scale.
-    # A factor that is not a unit cannot be recognised for an input of arbitrary scale.
+    # 4. Absorbed scale. The unit is still recognised if the input has an influence, and nearby
+    # factors do not fit clearly better. A factor that is not a unit cannot be recognised for an
+    # input of arbitrary scale.
     is_input_unit = hypothesis.scale == 1.0 and all(
         signal.kind == "inputs" for signal in hypothesis.signals
     )

@@ -82,7 +82,8 @@ class SheetRow:
     def to_document(self) -> dict[str, Any]:
         """Return the row as TOML data, which has no null.
 
-        Keys without a value are left out.
+        Keys without a value are left out. `another` is half the 95 % interval of the value in a log
+        or run that is not yet recorded, and `stated` the value in the model file.
         """
         row = {
             "state": self.state,
@@ -139,7 +140,8 @@ class _Rows:
             name: fitted_value.value for name, fitted_value in self.extended.parameters.items()
         }
         values_by_name = {**self.extended.constants, **parameters}
-        # Fitted parameters of the system; further fitted numbers are coefficients of effects.
+        # Names of the fitted parameters of the system, and their indices in the covariance, which
+        # also has the fitted coefficients of effects.
         indices, free = [], []
         for index, name in enumerate(self.detection_limits.free):
             if name in parameters:
@@ -148,9 +150,11 @@ class _Rows:
         covariance = self.detection_limits.covariance[np.ix_(indices, indices)]
         for quantity in self.subject.kind.system.derived:
             try:
+                # `of` computes the quantity from parameters and constants by name.
                 value = quantity.of(values_by_name)
             except (KeyError, ZeroDivisionError):
-                # A constant that differs between runs has no single value.
+                # A constant that differs between runs has no single value, so it is not in
+                # `values_by_name`; a constant of zero may divide by zero.
                 continue
             gradient: Array = np.zeros(len(free))
             for i, name in enumerate(free):
@@ -194,7 +198,8 @@ class _Rows:
         for name, fitted_value in self.extended.parameters.items():
             effect_name, _, place = name.partition("@")
             if place not in self.subject.places:
-                # Of an effect with several coefficients, the name of one follows after a point.
+                # The name may have a coefficient at its end. Of an effect with several
+                # coefficients, the name of one follows after a point.
                 place, _, _ = place.rpartition(".")
             if place in self.subject.places:
                 effect = f"{effect_name}@{place}"
@@ -299,7 +304,8 @@ class _Rows:
         """Build the row of an effect that is not in the model, with its detection limit.
 
         If the effect changes a number of the model file, for example by a share of the mass, the
-        limit is converted to the unit of that number.
+        limit is converted to the unit of that number. Causes of the verdict that have the effect as
+        alternative become the alternatives of the row.
 
         Args:
             effect: name of the effect, with its place.
@@ -308,6 +314,7 @@ class _Rows:
             detection_limit: limit of the coefficient.
         """
         file_value = self.subject.get_model_file_value(effect)
+        # Value in the model file; None if the file has none.
         value = None
         if file_value is not None:
             unit, value = file_value.unit, file_value.value
@@ -594,7 +601,8 @@ def format_evidence(row: SheetRow, is_short: bool = False) -> str:
     if row.state == "fitted":
         has_interval = row.number is not None and row.number.low is not None
         return "fitted" if has_interval else "not identified by these data"
-    # Otherwise the row is a diagnosed cause.
+    # Otherwise the row is a diagnosed cause. A p-value above the limit means that the search ended
+    # before the cause was tested.
     is_judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
     unjudged_text = "not tested" if is_short else "the search ended before it was tested"
     phrases = [format_p_value(row.p_value) if is_judged else unjudged_text]

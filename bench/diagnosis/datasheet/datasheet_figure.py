@@ -109,6 +109,7 @@ def draw_sheet(content: SheetContent) -> Figure:
         # Without a diagram there is space for a table with a larger font.
         _draw_effects_not_shown(figure, content, size=_SMALL_SIZE + 1.4, table_top=top - 0.09)
         return figure
+    # The table of absent effects ends at the foot; the diagram fills the space above it.
     table_top = _draw_effects_not_shown(figure, content, size=_SMALL_SIZE)
     # Positions are shares of the page; the labels of the axes need 0.09 of the width and the
     # height.
@@ -176,6 +177,7 @@ def _draw_number_table(figure: Figure, content: SheetContent, top: float) -> flo
     for cells, weights in zip(table_cells, cell_weights, strict=True):
         # Lines of the table are a quarter wider apart than those of a text.
         top -= _LINE * 1.25
+        # Each cell begins at the left edge of its column.
         for x, text, weight in zip(columns, cells, weights, strict=True):
             figure.text(x, top, text, va="top", weight=weight, fontsize=size)
     return top - _LINE * 1.5
@@ -213,7 +215,7 @@ def _draw_effects_not_shown(
     """Draw a table, in two columns, of the effects that the data do not show.
 
     Each row has the name of the effect and its detection limit, which may need several lines. The
-    rows are split so that both columns are about equally high.
+    rows are split so that both columns are about equally high. Heights are shares of the page.
 
     Args:
         figure: Page to draw on.

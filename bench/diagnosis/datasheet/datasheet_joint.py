@@ -97,6 +97,9 @@ class SheetSubject:
 
         A joint is driven by an actuator of the robot's file, or by its recorded force; a system by
         any input. An input that is always zero does not count.
+
+        Args:
+            recording: Recorded runs with their inputs.
         """
         active_inputs = {
             name for run in recording.runs for name, signal in run.inputs.items() if signal.any()
@@ -148,7 +151,8 @@ class SheetSubject:
         for key, fitted_value in coefficients.items():
             coefficient, _, named_place = key.partition("@")
             # A coefficient for all places, such as a delay, has the same value here.
-            for coefficient_place in [named_place] if named_place else local_places:
+            places = [named_place] if named_place else local_places
+            for coefficient_place in places:
                 if coefficient_place in self.places:
                     yield f"{effect_name}@{coefficient_place}", coefficient, fitted_value
 
@@ -220,7 +224,8 @@ def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject
     joint = joints[0] if joint is None else joint
     if joint not in joints:
         raise make_unknown_name_error(f"joint of robot {kind.name}", joint, joints)
-    # The actuators of a joint are those of a subject, which is made without its places first.
+    # A subject finds the actuators of its joint, but needs them among its places. So a first
+    # subject without places is made to find them.
     actuators = SheetSubject(kind, joint, frozenset()).actuators
     channels = {f"{quantity}.{joint}" for quantity in ("q", "qd", "tau")}
     return SheetSubject(kind, joint, frozenset({joint, *actuators, *channels}))

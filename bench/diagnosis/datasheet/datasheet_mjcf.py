@@ -99,7 +99,7 @@ def describe_log_for_model(
     import tomli_w
 
     path = sheet.recording.path
-    # Runs name their log only if several logs were joined.
+    # Runs name their log only if several logs were joined; one description cannot refer to them.
     if path.suffix != ".csv" or any(run.log for run in sheet.recording.runs):
         return
     log_description = read_toml(get_description_path(path))
@@ -115,6 +115,7 @@ def describe_log_for_model(
     }
     for kind in ("channels", "inputs"):
         for name, description in log_description.get(kind, {}).items():
+            # Signals that the model does not have, such as switches of the motor, are left out.
             if name in model.signals:
                 document[kind][model.signals[name]] = {"file": file, "column": name, **description}
     yield f"{stem}.toml", tomli_w.dumps(document)
@@ -186,6 +187,7 @@ def _compute_friction_limits(
             for coefficient in effect.on(system)
         ]
     )
+    # System, parameters, constants, times, positions, velocities and inputs of the batch.
     state = StateSnapshot(
         system,
         np.repeat(theta, len(position), axis=0),
@@ -240,8 +242,14 @@ def build_mjcf(sheet: SheetContent, folder: Path) -> MjcfFiles:
 def _build_robot_files(sheet: SheetContent) -> MjcfFiles:
     """Build the MJCF default class of a joint of a robot, and the robot's model with this class.
 
-    The class is for the joint and its first actuator. The model is omitted if the class cannot be
-    used in it.
+    The class is for the joint of the sheet and its first actuator. The model is omitted if the
+    class cannot be used in it.
+
+    Args:
+        sheet: content of the data sheet.
+
+    Returns:
+        Contents of the files by name, and notes to the user.
     """
     kind: Any = sheet.subject.kind
     causes = collect_causes(sheet.extended)
@@ -410,7 +418,7 @@ def _map_effects_to_model(
                 f"{mean_limit:.4g} N·m"
             )
             continue
-        # An effect on the environment has no place.
+        # Place of the effect in the MJCF model; an effect on the environment has none.
         place = place_by_kind.get(effect.at, "")
         # A coefficient that is not in the file is zero.
         zero_value = FittedValue(0.0, "1", None, None)

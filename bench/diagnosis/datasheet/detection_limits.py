@@ -146,8 +146,10 @@ def make_limit_from_interval(
 ) -> DetectionLimit:
     """Return the detection limit of a fitted number: the larger end of its 95 % interval.
 
+    Such a number may be zero, as its interval contains zero.
+
     Args:
-        number: Fitted number with its interval.
+        number: Fitted number with its interval; an end that is not known counts as zero.
         file_value: Its value in the model file, by which the limit is scaled; None if the file has
             none.
     """
@@ -215,7 +217,8 @@ def compute_detection_limits(
     models = ModelSet(evaluator, white_noise, frozenset(), make_rng("sheet"), noise_floor.is_stated)
     model = models.add_fit(fit)
     likelihood = model.likelihood
-    # The residual of the model is taken as the noise, whatever the recording specifies.
+    # The residual of the model is taken as the noise, whatever the recording specifies. It is not
+    # zero, because derivatives are divided by it.
     noise = NoiseModel(np.maximum(likelihood.sigma, 1e-300), likelihood.phi)
     # 3. Directions and limits.
     directions = _add_small_gaps(evaluator, fit, compute_directions(evaluator, fit, names))
@@ -234,27 +237,32 @@ def compute_detection_limits(
 def _add_small_gaps(
     evaluator: RunEvaluator, fit: TrajectoryFit, directions: DirectionSet
 ) -> DirectionSet:
-    """Add directions of backlash that is smaller than the search tries.
+    """Add directions of backlash of an input (or a dead band, or a limit) below the tried sizes.
 
-    A direction is the change of the runs by an effect. Backlash is not linear in its size, so each
-    size is simulated. Otherwise the smallest direction may already be detectable, and the detection
-    limit would be unknown. Each size is half the previous one, `GAP_HALVINGS` times.
+    A direction is the change of the runs by an effect. These effects are not linear in their size,
+    so each size is simulated. If the smallest backlash that the search tries is detectable, smaller
+    ones may be, too, and the detection limit would be unknown. Each further size is half the
+    previous one, `GAP_HALVINGS` times.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
         fit: fit of the model, at which the directions are computed.
         directions: directions of all candidates.
     """
-    # A probe is an effect with given coefficients; that of backlash has one: its size.
+    # A probe is an effect with given coefficients; its direction is valid only at this size if
+    # `is_single_size`. Backlash and dead bands have one coefficient, their size.
     smallest_probes: dict[str, CandidateDirection] = {}
     for probe in directions.candidates:
-        is_backlash = (
+        # Whether the size is one of an input or a servo error, such as a dead band. The other
+        # kinds, for example rate limits and compliances, are only tried at the sizes of the search.
+        is_input_level = (
             probe.is_single_size
             and evaluator.available_effects[probe.effect].coefficients[0].of
             not in NONLINEAR_COEFFICIENT_KINDS
         )
         smallest = smallest_probes.get(probe.effect)
-        if is_backlash and (smallest is None or probe.coefficients[0] < smallest.coefficients[0]):
+        is_smaller = smallest is None or probe.coefficients[0] < smallest.coefficients[0]
+        if is_input_level and is_smaller:
             smallest_probes[probe.effect] = probe
     smaller_probes = [
         replace(probe, coefficients=probe.coefficients * 0.5**halvings)
@@ -359,6 +367,7 @@ class _DetectionLimitCalculator:
             parameter_block, fisher_blocks.cross, fisher_blocks.states
         )
         # The columns are the q parameters, then the K candidates, and the residual as the last one.
+        # So `[self.q : -1]` selects the candidates, and `[-1]` the residual.
         inner = slice(0, self.q)
         self.covariance = invert_scaled(parameter_block[inner, inner], self.products[inner, inner])
         cross_products = self.products[self.q : -1, : self.q]  # d'A
@@ -468,6 +477,7 @@ class _DetectionLimitCalculator:
             Names in descending order of their contribution.
         """
         i = self.q + k
+        # Nothing is confounded if the parameters leave most of the information.
         if self.powers[k] > (1.0 - CONFOUNDING_CORRELATION**2) * self.products[i, i]:
             return ()
         # Norm of each parameter's part in the direction of the candidate, relative to the largest.
@@ -498,6 +508,7 @@ class _DetectionLimitCalculator:
             for (effect, _), candidate in best.items()
             if effect in simpler_effects
         ]
+        # A simpler effect in the model has columns among those of the fitted parameters.
         for effect in simpler_effects & set(self.evaluator.coefficient_slices):
             coefficient_indices = self.evaluator.get_coefficient_indices(effect)
             simpler_columns += [
@@ -538,7 +549,8 @@ class _DetectionLimitCalculator:
         # Information on a candidate before the parameters absorb a part of it.
         (_, smallest), (_, largest) = sizes_and_candidates[0], sizes_and_candidates[-1]
         information = np.diagonal(self.products)[self.q : -1]
-        # A limit acts more the smaller it is.
+        # It is a limit if the smallest size has more influence than the largest one; else a
+        # backlash.
         if information[smallest] > information[largest]:
             return DetectionLimit(max(detectable_sizes, default=np.inf), limit="below")
         return DetectionLimit(min(detectable_sizes, default=np.inf), limit="above")

@@ -103,7 +103,7 @@ class DriveDiagram:
     def to_document(self) -> dict[str, Any]:
         """Return the diagram with the names of its laws as TOML data.
 
-        The curves are thinned to every tenth part of their points.
+        Of each curve, about ten evenly spaced points are returned.
         """
         return {
             "unit": self.unit,
@@ -184,7 +184,7 @@ def _find_roots(function: Callable[[Array], Array], search_range: float, count: 
         middle = 0.5 * (low + high)
         is_positive = function(middle) > 0
         low, high = np.where(is_positive, low, middle), np.where(is_positive, middle, high)
-    # Points within the rounding error of the bisection are exactly zero.
+    # A root within the rounding error of the bisection is set to exactly zero.
     root: Array = np.where(np.abs(high) < ROUNDING_SHARE * search_range, 0.0, 0.5 * (low + high))
     root[is_always_positive] = -np.inf
     root[is_never_positive] = np.inf

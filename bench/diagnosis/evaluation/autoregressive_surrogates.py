@@ -74,8 +74,8 @@ def draw_surrogates(
         observed_mask: (R, T, C) mask of available samples; the surrogates are zero elsewhere.
         count: number of surrogates.
         rng: random numbers for the innovations.
-        project_out: callback that returns the residual of a fit to noise (count, R, T, C); without
-            it the bias is not corrected.
+        project_out: callback that fits the model to pilots (count, R, T, C) as if they were data,
+            and returns the residuals of these fits; without it the bias is not corrected.
     """
     channels = residual.shape[2]
     # 1. Autoregressions.
@@ -147,14 +147,15 @@ def _simulate_autoregression(
 def _correct_bias(weights: Array, projected_pilots: Array, observed_mask: Mask) -> Array:
     """Correct weights (p,) for the bias of a fit, by eq. (2) of the module docstring.
 
-    The surrogates have the weights a, and a fit to them gives the weights a*. The corrected weights
-    are a + s (a - a*), where s is the largest share of 1 for which the process is stationary.
+    The surrogates have the weights a. After a fit of the model to them, their residuals have the
+    weights a*. The corrected weights are a + s (a - a*), where s is the largest share of 1 for
+    which the process is stationary; without such a share, they stay as they are.
 
     Shapes: R runs, T samples.
 
     Args:
         weights: (p,) weights of an autoregression.
-        projected_pilots: (count, R, T) surrogates with these weights, after a fit of the model.
+        projected_pilots: (count, R, T) residuals of a fit of the model to such surrogates.
         observed_mask: (R, T) mask of available samples.
     """
     order = weights.size
@@ -189,7 +190,8 @@ def _drive_autoregression(weights: Array, innovations: Array) -> Array:
     flat = innovations.reshape(len(innovations), -1)
     # The weight of the oldest sample comes first, in the order of the samples.
     reversed_weights = weights[::-1]
-    # A sample depends only on earlier ones, which are complete by then.
+    # A sample depends only on earlier ones, which are complete by then. The first one has none, and
+    # stays as it is.
     for t in range(1, len(flat)):
         previous = flat[max(t - order, 0) : t]
         # The first samples have fewer than `order` predecessors.
@@ -302,7 +304,8 @@ def _compute_innovations(filled: Array, observed_mask: Mask, weights: Array) -> 
     """
     order, length = weights.size, observed_mask.shape[1]
     predicted = np.zeros(1)
-    # Whether a sample and all samples that predict it are recorded.
+    # Whether a sample and all samples that predict it are recorded. The first `order` samples have
+    # no complete prediction, and are left out.
     is_complete = observed_mask[:, order:]
     for k, weight in enumerate(weights, start=1):
         lagged_samples = slice(order - k, length - k)

@@ -107,8 +107,8 @@ def find_step_refinements(evaluator: RunEvaluator, noise: NoiseModel) -> Iterato
     error = motions.compute_rms_difference(motions.get_motion(model_settings), reference)
     if not error > MIN_DISCRETISATION_ERROR:
         return
-    # 3. Settings with a small error. One that reduces the error clearly, but leaves more of it, is
-    # also yielded: the caller accepts it for a model with a large residual
+    # 3. Settings with an error below `MAX_CORRECTED_ERROR`. One that reduces the error clearly, but
+    # leaves more of it, is also yielded: the caller accepts it for a model with a large residual
     # (`StepRefinement.is_accurate_enough`).
     clearly_reduced_error = min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
     max_error = max(MAX_CORRECTED_ERROR, clearly_reduced_error)
@@ -231,7 +231,8 @@ class _ReferenceMotions:
             refined = simulate(STIFF_INTEGRATOR, 2 * divisor)
             return 2.0 * refined - coarse
 
-        # Divisors of the time step to try; each is compared with a step of half the size.
+        # Divisors of the time step to try. The motion of each is compared with that of half the
+        # step, which is returned if they agree.
         for divisors, compute_motion in (
             ((1, 2, 5), partial(simulate, "RK4")),
             ((2, 5), extrapolate),
@@ -290,11 +291,12 @@ def correct_discretisation(
         theta: (P,) parameters of a model near the data.
         states: (R, s) initial states of the model.
     """
-    # Only robots without contact have a linearisation. Other systems are not simulated at a fixed
-    # step, and an impact is not smooth in the step size.
+    # Robots without contact are those that have a linearisation. Other systems are not simulated at
+    # a fixed step, and an impact is not smooth in the step size.
     if not evaluator.has_linearisation:
         return
     assert issubclass(evaluator.kind, RobotSimulator)
+    # The finer simulators have the same effects, because theta has their coefficients.
     effects = [*evaluator.library, *evaluator.extra_effects]
     run_count = len(evaluator.prepared_runs)
     scenarios = [run_data.scenario for run_data in evaluator.prepared_runs]
@@ -307,7 +309,7 @@ def correct_discretisation(
         finer = kind(evaluator.recording.constants, evaluator.channels, effects=effects)
         motions.append(finer.simulate_batch(thetas, scenarios, initial_states))
     usual_step, half_step, quarter_step = motions
-    # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
+    # Cost in units of a run with the usual step: 1, 2 with half of the step, and 4 with a quarter.
     evaluator.simulation_count += 7 * run_count
     correction = 2.0 * quarter_step - half_step - usual_step  # (2)
     squared_errors = np.square(correction / noise.sigma)[np.isfinite(evaluator.observed)]

@@ -191,20 +191,20 @@ class ForkedWorkerPool:
     def _fork_workers(self) -> None:
         """Fork `jobs` workers, each with its own pipe to this process.
 
-        A forked worker inherits the run evaluators of `register` without a copy, so that tasks
-        can refer to them by number. Its main function is `_run_worker`.
+        A forked worker inherits the run evaluators of `register` without a copy, so that a task
+        refers to its evaluator by an index. The main function of a worker is `_run_worker`.
         """
         # One byte of memory that all workers share: a value other than zero asks them to stop.
         if self._stop_flag is None:
             self._stop_flag = mmap.mmap(-1, 1)
         context = multiprocessing.get_context("fork")
-        # Frozen objects stay in shared memory pages: garbage collection in a worker does not write
-        # to them.
+        # Frozen objects are ignored by the garbage collection of a worker, which would write to
+        # their memory pages, so that these could no longer be shared.
         gc.freeze()
         for _ in range(self._jobs):
             parent_end, worker_end = context.Pipe()
-            # A worker that inherits ends of other pipes would keep the workers of these pipes
-            # alive.
+            # The worker closes the ends of other pipes that it inherits. Otherwise these pipes
+            # would stay open when the parent ends, and their workers would not end.
             other_pipes = [parent_end, *(worker.pipe for worker in self._workers)]
             worker_arguments = (
                 self._inherited_evaluators,
@@ -238,10 +238,13 @@ class ForkedWorkerPool:
             evaluator: first argument of the task, which the workers have inherited.
             task: a module-level function.
             items: further arguments of each call.
+
+        Yields:
+            The number of an item and its result, in any order.
         """
         # Error and traceback by item number.
         errors: dict[int, tuple[Exception, str]] = {}
-        # Numbers of the items, the next one last.
+        # Numbers of the items in descending order, because `pop` takes the last one.
         unprocessed = list(range(len(items)))[::-1]
         # Pipes of working workers with the number of their item, and pipes of idle workers.
         busy: dict[Connection, int] = {}
@@ -346,7 +349,9 @@ class _Pickler(pickle.Pickler):
         """
         if type(value) is not np.ndarray or value.ndim < 2 or value.flags.c_contiguous:
             return NotImplemented
-        # The axis with the largest stride (in bytes) is the outermost one in memory.
+        # The axis with the largest stride (distance of neighbours in bytes) is the outermost one in
+        # memory. With the axes in this order, the array is contiguous. The second `argsort` is the
+        # inverse permutation, which restores the order.
         order = np.argsort([-abs(stride) for stride in value.strides], kind="stable")
         return _restore_axes, (np.ascontiguousarray(value.transpose(order)), np.argsort(order))
 
@@ -417,7 +422,7 @@ def _run_worker(
         return
     for other_pipe in other_pipes:
         other_pipe.close()
-    # Tasks within a task run in this process.
+    # A worker has no workers of its own: tasks within a task run in this process.
     for evaluator in evaluators:
         evaluator.worker_pool = ForkedWorkerPool()
     # 2. Requests.
@@ -427,8 +432,8 @@ def _run_worker(
         except (EOFError, OSError):
             return
         evaluator = evaluators[evaluator_index]
-        # 3. Task.
-        # A new search control for each task, which knows the stop flag and keeps the deadline.
+        # 3. Task. A new search control for each task, so that an earlier stop does not count. It
+        # stops at the stop flag, which the parent sets, or at the deadline.
         deadline = evaluator.search_control.deadline
         evaluator.search_control = SearchControl(stop=lambda: stop_flag[0] != 0)
         evaluator.search_control.deadline = deadline

@@ -81,7 +81,7 @@ def prepare_run(
     # Constants of a run are valid only in this run.
     constants = {**recording.constants, **run.constants}
     guesses = _guess_initial_states(run, simulator)
-    # States that a fit does not estimate: they are specified, or no channel shows them.
+    # Names of states that a fit does not estimate: they are specified, or no channel shows them.
     fixed = {*run.initial, *_find_unobserved_states(simulator)}
     # Initial values that are not states of the system, such as the pose of a floating base, are the
     # same in all simulations of the run. They are stated, or follow from closed loops.
@@ -212,7 +212,7 @@ def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:
     constant = simulator.constant_values.get("gravity", DEFAULT_GRAVITY)
     gravity = float(run.constants.get("gravity", constant))
     seconds = float(run.times[-1] - run.times[0])
-    # Allow for twice the fall due to gravity and for a fast downward throw.
+    # Height lost by a fast downward throw, and by twice the fall gravity * seconds² / 2.
     return DEFAULT_START_HEIGHT + MAX_UNKNOWN_FALL_SPEED * seconds + gravity * seconds**2
 
 
@@ -232,7 +232,8 @@ def estimate_resting_position(readings: Array, sigma: float) -> float | None:
     """
     recorded = readings[np.isfinite(readings)]
     counts = np.arange(1, recorded.size + 1)
-    # Relative to the first reading (a slice, because there may be none), in units of the noise.
+    # Relative to the first reading, in units of the noise. `[:1]` instead of `[0]`, because there
+    # may be no readings.
     scaled = (recorded - recorded[:1]) / sigma
     # Sums of squares about the mean of the first n = 1, 2, ... readings. At rest they are
     # chi-squared, with mean n - 1 and standard deviation of about sqrt(2 n).

@@ -84,7 +84,8 @@ def compute_noise_floor(evaluator: RunEvaluator, recording: Recording) -> NoiseF
         is_specified = recording.noise.get(channel.name, 0.0) > 0
         sigma = recording.noise[channel.name] if is_specified else estimate.sigma
 
-        # There may be too few samples; a channel that never changes does not show its noise.
+        # No estimate: there are too few samples, or a channel never changes and does not show its
+        # noise.
         if not np.isfinite(sigma) or (not is_specified and is_constant(values)):
             sigma = DEFAULT_FLOOR_SHARE * channel.scale
         # No simulation is accurate enough for a noise floor of zero.
@@ -169,8 +170,8 @@ def _compute_added_noise(recording: Recording, name: str) -> float:
     # A quantised channel has the noise of its steps, also while the robot rests.
     if estimate_noise(signals).step > added_sigma:
         return 0.0
-    # A channel with far less noise than this is noise-free. The estimate is not finite if all runs
-    # are too short for the differences; then nothing is added.
+    # A channel with far less noise than `added_sigma` is noise-free. The estimate is not finite if
+    # all runs are too short for the differences; then nothing is added.
     sigma = estimate_differences_sigma(signals, DIFFERENCE_ORDER)
     return added_sigma if sigma < MAX_NOISE_FREE_SHARE * added_sigma else 0.0
 

@@ -178,7 +178,8 @@ def maximise_likelihood(
     log_likelihood = 0.0
     sigmas: list[float] = []
     phis: list[float] = []
-    # The degrees of freedom of the fit are distributed over the channels by their samples.
+    # The degrees of freedom of the fit are distributed over the channels by their samples, so that
+    # the same share of the samples remains in each.
     samples = max(int(observed_mask.sum()), 1)
     degrees_of_freedom_ratio = max(1.0 - fitted_freedom / samples, MIN_EFFECTIVE_SAMPLE_SHARE)
     for channel_index in range(residual.shape[2]):

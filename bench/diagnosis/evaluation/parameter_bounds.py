@@ -189,7 +189,8 @@ def _compute_fit_bounds(
     if parameter.unit == "Hz":
         # The lower bound is at most half of the upper bound, so that the range is not empty.
         low = min(max(low, MIN_CYCLES_PER_RUN / longest_run), high / 2.0)
-    # A positive lower bound marks a shape parameter, such as a frequency, a rate or a sharpness.
+    # A positive lower bound marks a shape parameter, such as a frequency, a rate or a sharpness. It
+    # is not widened.
     if low > 0:
         return low, high
     if parameter.unit == "s":
@@ -264,9 +265,9 @@ def use_bounds(evaluator: RunEvaluator, new_bounds: Mapping[str, Bounds]) -> Non
 def get_physical_limits(evaluator: RunEvaluator, index: int) -> Bounds:
     """Return the physical limits of a base parameter; for a robot, those of its total value.
 
-    For example, a mass cannot be negative. A robot's free number is fitted as an effect that
-    corrects a number of its model file. Without an upper limit of the total, it is limited to a
-    multiple of its plausible range.
+    For example, a mass cannot be negative. A number of a robot's model file that is fitted (a
+    freed parameter) is corrected by an effect; the limits are those of the effect's coefficient.
+    Without an upper limit of the total, it is limited to a multiple of its plausible range.
 
     Args:
         evaluator: run evaluator of the runs to which models are fitted.
@@ -282,7 +283,8 @@ def get_physical_limits(evaluator: RunEvaluator, index: int) -> Bounds:
     if lower_limit is None:
         lower_limit = -np.inf
     if upper_limit is None:
-        # An effect at a place of a robot has the same range for every kind of system.
+        # `plausible` has a range for each kind of system (point, linear, rotary); those of an
+        # effect at a place of a robot are equal.
         _, plausible_maximum = coefficient.plausible[0]
         upper_limit = MAX_RANGE_FACTOR_MODEL_FILE * plausible_maximum
     return lower_limit, upper_limit

@@ -142,8 +142,9 @@ class RunEvaluator:
     ) -> None:
         """Build the simulator with all observable effects, and prepare the runs as padded arrays.
 
-        An effect is included if the recorded channels and inputs can show it. The docstring of the
-        class describes the attributes.
+        An effect is included if the recorded channels and inputs can show it. All of them are off
+        unless their coefficients in theta are nonzero; theta is the vector of all parameters. The
+        docstring of the class describes the attributes.
 
         Args:
             kind: class of the simulator.
@@ -162,7 +163,7 @@ class RunEvaluator:
         applicable_effects = library.list_effects_for(kind.system)
         recorded_signals = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
         # An effect on a channel that is not recorded is not observable. Effects with hidden states,
-        # such as backlash, need an engine that integrates these.
+        # such as backlash, need a robot simulator (`has_model`) or an engine that integrates these.
         observable_effects = [
             name
             for name, effect in applicable_effects.items()
@@ -188,6 +189,8 @@ class RunEvaluator:
             self.system_parameter_count + len(self.freed_constants)
         )
         self.coefficient_slices = _allocate_coefficients(self.simulator, self.base_indices.size)
+        # Indices in theta of coefficients that shift sample times, and of those that need fine
+        # steps.
         self._shifting_coefficients, self._fine_step_coefficients = (
             self._find_delaying_coefficients()
         )
@@ -205,10 +208,11 @@ class RunEvaluator:
             [t.initial_state_guess for t in self.prepared_runs]
         )
         self.longest_duration = self._get_longest_duration()
+        # Ranges of delays and frequencies depend on the duration and the sample interval.
         self.parameters = self._scale_coefficient_ranges()
         self.time_span = self._get_time_span()
         self._channel_ranges: dict[str, float] = {}
-        # What filters and linearisations of a robot provide later.
+        # What filters and linearisations of a robot provide later; empty until then.
         self.state_derivatives: Array | None = None
         self.discretisation_correction: Array | None = None
         self.cached_linearisations: dict[tuple[int, bytes, bytes], Any] = {}
@@ -228,7 +232,11 @@ class RunEvaluator:
     def _create_simulators(self) -> tuple[SystemSimulator, SystemSimulator]:
         """Create the simulator with all available effects, and a copy with a finer time step.
 
-        The copy simulates coefficients that need fine steps, such as those of filters.
+        The copy simulates batch elements in which effects act that need fine steps, such as filters
+        of sensors.
+
+        Returns:
+            The simulator with the usual time step, and the one with the fine step.
         """
         kind = self.kind
         effects: list[str | type[Effect]] = list(self.library)
@@ -305,7 +313,7 @@ class RunEvaluator:
         if name not in self.channels:
             return 0.0, 0.0
         values = self.observed[:, :, self.channels.index(name)]
-        # An initial value also avoids an error where all samples are missing.
+        # The initial values avoid an error of NumPy where all samples are missing.
         return float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=-np.inf))
 
     def _get_effect_coordinate(self, effect: str) -> str:
@@ -511,7 +519,7 @@ class RunEvaluator:
             self, RunEvaluator._simulate_runs, calls
         ):
             sample_count = simulated.shape[1]
-            # A single complete result need not be copied.
+            # The result of a single call over whole runs is complete, and need not be copied.
             if len(calls) == 1 and sample_count == length:
                 return simulated
             simulated_runs[element_indices[number], :sample_count] = simulated
@@ -522,7 +530,7 @@ class RunEvaluator:
         """Return a `RunEvaluator` of other runs that were cut or thinned from these runs.
 
         It shares the parameters, the search control and the worker pool, and the durations and
-        ranges from which the values of shape parameters, such as frequencies, are chosen.
+        ranges from which the tried values of shape parameters, such as frequencies, are chosen.
 
         Args:
             runs: the other runs, such as segments of these.
@@ -585,10 +593,11 @@ class RunEvaluator:
         return kind(self.recording.constants, self.channels, effects=effects)
 
     def group_compatible(self, theta: Array) -> Indices:
-        """Return group numbers (L,); batch elements of one group can share an engine call.
+        """Return group numbers (L,), 0 to 3; batch elements of one group can share an engine call.
 
         Elements of one call have the same time steps. Groups 1 and 3 have effects that read signals
-        at other times, such as delays; groups 2 and 3 have effects that need fine steps.
+        at other times, such as delays; groups 2 and 3 have effects that need fine steps; group 0
+        has neither.
 
         Shapes: P parameters.
 
@@ -740,6 +749,7 @@ class RunEvaluator:
             observe: names of the channels.
             effects: names of the effects.
         """
+        # Effects of the library are given by name, extra ones by class.
         effect_types: list[str | type[Effect]] = [
             next((e for e in self.extra_effects if e.name == name), name) for name in effects
         ]
@@ -781,7 +791,8 @@ class RunEvaluator:
         of the other joints.
         """
         system = self.simulator.system
-        # All floating states are required from the user, so that none follows from a loop.
+        # Required floating states are those that no loop determines, so that a recording states
+        # them. If all are required, there is nothing to place.
         if system.floating_state_units.keys() == system.required_state_units.keys():
             return
         prepared_runs = []
@@ -797,7 +808,7 @@ class RunEvaluator:
             scenario = replace(scenario, initial=initial)
             prepared_runs.append(replace(prepared, scenario=scenario))
         self.initial_state_guesses, self.prepared_runs = guesses, tuple(prepared_runs)
-        # Cached scenarios and the copies in workers have the old initial states.
+        # Cached scenarios and the copies of this evaluator in workers have the old initial states.
         self._shortened_scenarios.clear()
         self.worker_pool.forget(self)
 

@@ -292,7 +292,9 @@ class SearchControl:
     def use_reserve(self) -> Iterator[None]:
         """Continue a search that its time limit ended, until the reserve is used up.
 
-        A search that the user ended is not continued.
+        The reserve is the part of the time limit after the deadline of the search, for the
+        validation of its result. A search that the user ended is not continued. Afterwards the
+        search is over as before.
         """
         state = self.deadline, self._stop_reason, self._has_abandoned_fits
         if self.deadline is not None:
@@ -328,8 +330,9 @@ class SearchControl:
         Args:
             share: finished share of the present step, 0 to 1.
         """
-        # Part of the question that remains after the finished steps, and then after a part of the
-        # present one.
+        # Each step takes the share `PROGRESS_STEP_SHARE` of what remains. First the part of the
+        # question that remains after the finished steps, then the finished part, with that of the
+        # present step.
         remaining_share = (1.0 - PROGRESS_STEP_SHARE) ** self._finished_steps
         finished_share = 1.0 - remaining_share * (1.0 - PROGRESS_STEP_SHARE * share)
         total_weight = self._finished_weight + self._current_weight + self._later_weight

@@ -19,14 +19,14 @@ class SimulationCache:
     """
 
     def __init__(self) -> None:
-        self._held: dict[bytes, Array] = {}
+        self._cached: dict[bytes, Array] = {}
         self._bytes = 0
 
     def missing(self, keys: Sequence[bytes]) -> list[int]:
         """Return the indices of elements that are not cached; of equal ones only the first."""
         # In reversed order, the first of equal elements is the one that stays.
         first_indices = {key: index for index, key in reversed(list(enumerate(keys)))}
-        return sorted(index for key, index in first_indices.items() if key not in self._held)
+        return sorted(index for key, index in first_indices.items() if key not in self._cached)
 
     def fill(
         self, keys: Sequence[bytes], missing_indices: Sequence[int], results: Array, out: Array
@@ -47,11 +47,11 @@ class SimulationCache:
             keys[index]: result for index, result in zip(missing_indices, results, strict=True)
         }
         for index, key in enumerate(keys):
-            out[index] = new_results[key] if key in new_results else self._held[key]
+            out[index] = new_results[key] if key in new_results else self._cached[key]
         for key, result in new_results.items():
             # Store a copy: a view would keep the results of a whole call in memory.
-            self._held[key] = result.copy()
+            self._cached[key] = result.copy()
             self._bytes += result.nbytes
         # The oldest entry of a dictionary comes first.
         while self._bytes > CACHE_BYTES:
-            self._bytes -= self._held.pop(next(iter(self._held))).nbytes
+            self._bytes -= self._cached.pop(next(iter(self._cached))).nbytes

@@ -44,10 +44,12 @@ def adapt_to_time_scale(parameter: Parameter, longest: float, spacing: float) ->
         if low > 0:
             high = max(high, MAX_DECAY_FACTOR * longest)
         else:
-            # A delay may have either sign, so both ends are scaled by the same factor.
+            # A delay may have either sign, so both ends are scaled by the same factor, which makes
+            # the upper end at least `MAX_DELAY_SHARE` of the longest run.
             factor = max(1.0, MAX_DELAY_SHARE * longest / high)
             low, high = factor * low, factor * high
     elif parameter.unit == "Hz" and spacing > 0 and 0.5 / spacing < high:
+        # The Nyquist frequency.
         high = 0.5 / spacing
         low = min(low, high / FREQUENCY_RANGE_RATIO)
     if (low, high) == parameter.bounds:

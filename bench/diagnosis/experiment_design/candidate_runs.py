@@ -145,16 +145,19 @@ class RigModel:
         for name, value in self._iterate_initial_states():
             states = {**dict(plan.states), name: value}
             yield replace(plan, states=tuple(states.items()))
+        # The changed constant comes last; its value in the plan, if it has one, is left out.
         for name, values in self._list_adjustable_constants().items():
             other_constants = dict(plan.constants)
             other_constants.pop(name, None)
             for value in values:
                 yield replace(plan, constants=(*other_constants.items(), (name, value)))
         if plan.driven_inputs:
+            # Offset and size are factors of the largest recorded command.
             for level in COMMAND_OFFSET_FACTORS:
                 yield replace(plan, level=level)
             for size in COMMAND_SIZE_FACTORS:
                 yield replace(plan, size=size)
+        # Each command is held for several sampling intervals; too few samples tell nothing.
         for hold_factor in HOLD_FACTORS:
             if self.seconds / (self.step * hold_factor) >= MIN_SAMPLES:
                 yield replace(plan, hold_factor=hold_factor)
@@ -268,6 +271,7 @@ class RigModel:
             input_text = plan.driven_inputs[0] if len(plan.driven_inputs) == 1 else "all inputs"
             text = f"{input_text}: {plan.form}, {plan.size:g} times the recorded amplitude"
         else:
+            # Nothing is driven: the system moves from its initial state only.
             text = "release"
         if plan.level:
             medians = [f"{name} = {np.median(inputs[name]):.3g}" for name in plan.driven_inputs]
@@ -366,7 +370,11 @@ class ChangedRun(NamedTuple):
 def iterate_changed_runs(evaluator: RunEvaluator) -> Iterator[ChangedRun]:
     """Yield runs like the first recorded one with one changed duration, initial state or input.
 
-    If several discriminate two models equally well, the first one is proposed.
+    An experimenter can make each of these changes. If several runs discriminate two models equally
+    well, the first one is proposed.
+
+    Args:
+        evaluator: evaluator of the recorded runs.
     """
     limits = read_model_file_limits(evaluator)
     first = _get_first_run(evaluator, limits)
@@ -547,6 +555,7 @@ def _list_state_units(evaluator: RunEvaluator) -> list[str]:
     """
     system = evaluator.simulator.system
     units = {channel.name: channel.unit for channel in evaluator.kind.channels}
+    # A coordinate that is not a channel has no stated unit; metres are assumed.
     coordinate_units = [units.get(name, "m") for name in system.coordinates]
     rate_units = [f"{unit}/s" for unit in coordinate_units]
     # A user-defined system may have further states after the rates, in any unit.

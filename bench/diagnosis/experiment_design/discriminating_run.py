@@ -88,7 +88,7 @@ def propose_discriminating_run(
     ):
         discrimination, best_run = best
         description, change = best_run.says, best_run.change
-        # Only the limits exclude a run that distinguishes the models.
+        # Whether some run distinguishes the models, but only runs beyond the limits do.
         largest_discrimination, _ = runs_by_discrimination[0]
         is_limited = discrimination < MIN_DISCRIMINATION_SIGMAS <= largest_discrimination
     # 3. Description.
@@ -136,7 +136,7 @@ def _find_first_within_limits(
     for discrimination, run in runs:
         if discrimination < MIN_DISCRIMINATION_SIGMAS:
             return discrimination, run
-        # The check of the limits needs no plan, only scenario and initial state.
+        # The check of the limits needs no plan, only scenario and initial state; so it is empty.
         candidate = CandidateRun(RunPlan(), run.says, run.scenario, run.states)
         if all(all(limits(model, [candidate])) for model in models):
             return discrimination, run
@@ -183,8 +183,9 @@ def _compute_discrimination(
 ) -> float:
     """Simulate a run with two models, and return the RMS difference of their predictions.
 
-    It is sqrt(mean over samples and channels of ((y_model - y_other) / sigma)^2), in standard
-    deviations of the noise. The larger it is, the more clearly the run shows which model is right.
+    It is sqrt(mean over samples and channels of ((y_model - y_other) / sigma)^2) (1), in standard
+    deviations of the noise; NaN or infinite if a simulation fails. The larger it is, the more
+    clearly the run shows which model is right.
 
     Args:
         evaluator: run evaluator that simulates the run.

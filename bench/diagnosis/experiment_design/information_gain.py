@@ -134,10 +134,12 @@ class RunRanker:
 
         The attributes are:
 
-        - `information`: inverse covariance of the parameters of each model, C^-1 in eq. (1).
+        - `information`: inverse covariance C^-1 of the parameters of each model by the present
+          data, eq. (1) of the module docstring.
         - `pairs`: all ordered pairs of indices (true model, competing model).
-        - `max_total_value`: total value above which a run gains nothing more.
-        - `max_exact_evaluations`: maximum number of exact evaluations in a row.
+        - `max_total_value`: value of a run (its summed discrimination) at which all models are
+          distinguished, so that a larger one is not better; infinite with a single model.
+        - `max_exact_evaluations`: maximum number of exact evaluations (by fits) in a row.
         - `is_free_state`: (s,) mask of the initial states that have to be estimated.
 
         Shapes: s states of a run.
@@ -151,6 +153,7 @@ class RunRanker:
         self.information = [
             _compute_parameter_information(models, model) for model in competing_models
         ]
+        # Noise and limits are those of the model of the present diagnosis, which comes first.
         self.noise: NoiseModel = compute_fisher_blocks(models, competing_models[0]).noise
         self.limits = RigLimits(self.evaluator, competing_models[0])
         self.pairs = list(permutations(range(len(competing_models)), 2))
@@ -191,6 +194,7 @@ class RunRanker:
                 for information in self.information
             ]
             successful = [entry for entry in linearisations if entry is not None]
+            # The run is left out if it cannot be linearised with one of the models.
             if len(successful) == len(linearisations):
                 run_values.append(self._evaluate_linearised(run, successful))
         return sorted(run_values, key=get_sort_key)
@@ -230,6 +234,7 @@ class RunRanker:
         Args:
             entry: Candidate run with its linearised value.
         """
+        # The information gain of a single model needs no fit, so it is exact already.
         if not self.pairs:
             return entry._replace(is_exact=True)
         values = entry.values.copy()
@@ -237,7 +242,8 @@ class RunRanker:
             values[true_index, competing_index] = self._compute_discrimination(
                 entry.run, self.information[true_index], self.information[competing_index]
             )
-        # The run must be within the limits, whichever model is true.
+        # The run must be within the limits, whichever model is true. For the first model,
+        # `rank_runs` has tested this already.
         for information in self.information[1:]:
             if not all(self.limits(information.model, [entry.run])):
                 values[:] = 0.0
@@ -288,9 +294,13 @@ class RunRanker:
         """Whiten L predictions of a run (L, T, C), or differences of them, to vectors (L, T C).
 
         Whitening gives independent noise of variance one. `whiten` expects one run with L columns,
-        (1, T, C, L), and the mask (1, T, C).
+        (1, T, C, L), and the mask (1, T, C) of observed samples; all samples of a run that is only
+        planned count as observed.
 
         Shapes: T samples, C channels.
+
+        Args:
+            values: (L, T, C) predictions or differences, in the units of the channels.
         """
         is_observed = np.ones((1, *values.shape[1:]), dtype=np.bool_)
         columns = np.moveaxis(values, 0, -1)[None]
@@ -325,7 +335,8 @@ class RunRanker:
             The linearisation; None if the simulation fails, or if the run amplifies differences of
             the initial state so much that its result could not be interpreted.
         """
-        # 1. Simulations: the point itself, displaced parameters, then displaced initial states.
+        # 1. Simulations: the point itself, displaced parameters, then displaced initial states. A
+        # parameter is displaced by its unit `spread`, about its standard error.
         initial_state = run.states if states is None else states
         free_indices = information.model.fit.free_indices.tolist()
         thetas, initial_states = [theta], [initial_state]
@@ -341,7 +352,7 @@ class RunRanker:
         if not np.isfinite(simulated).all():
             return None
         prediction, differences = simulated[:1], simulated[1:] - simulated[0]
-        # 2. Amplification.
+        # 2. Amplification: change of a channel by a displaced initial state, in units of its scale.
         parameter_count = len(free_indices)
         channel_scales = np.array([channel.scale for channel in self.evaluator.simulator.channels])
         amplification = np.abs(differences[parameter_count:]) / channel_scales
@@ -494,10 +505,12 @@ def _compute_remaining_difference(
     )
     normal, right_hand_side = columns.T @ columns, columns.T @ difference
     # The present data hold the parameters near their estimates: C^-1 in eq. (1).
+    # A fit that is already away from them (`deviation`) is drawn back.
     normal[:parameter_count, :parameter_count] += information.inverse
     right_hand_side[:parameter_count] -= information.inverse @ deviation
     damped = normal + damping * np.diag(np.diagonal(normal)) + RIDGE * np.eye(len(normal))
     step = np.linalg.solve(damped, right_hand_side)
+    # The cost is a quadratic function of the step, so its value after the step is known exactly.
     initial_cost = float(difference @ difference + deviation @ information.inverse @ deviation)
     minimum_cost = initial_cost - 2.0 * float(right_hand_side @ step) + float(step @ normal @ step)
     return max(minimum_cost, 0.0), step[:parameter_count], step[parameter_count:]

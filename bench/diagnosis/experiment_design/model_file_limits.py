@@ -66,6 +66,7 @@ def read_model_file_limits(evaluator: RunEvaluator) -> StatedLimits:
     forces = {}
     for name, joint in joints.items():
         actuators = [actuator for actuator in robot.actuators if actuator.joint == name]
+        # A joint with neither has no entry: `RigLimits` limits its force by the present runs.
         if joint.effort is not None:
             forces[f"tau.{name}"] = _get_effort_limit(robot, joint)
         elif actuators and all(actuator.force is not None for actuator in actuators):

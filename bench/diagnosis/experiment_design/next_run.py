@@ -84,7 +84,12 @@ class NextRunDesign:
         return len(self.groups) == len(self.discrimination) + 1
 
     def to_document(self) -> dict[str, Any]:
-        """Return the design as JSON data; the command signals are written as a table instead."""
+        """Return the design as JSON data; the command signals are written as a table instead.
+
+        `by` is the criterion, T or D. For T, `told` has the discrimination of each competing effect
+        from `effect`, `split` the effects that the run distinguishes, and `settles` whether these
+        are all.
+        """
         return {
             "says": self.says,
             "by": self.by,
@@ -145,7 +150,7 @@ def _format_discrimination(design: NextRunDesign) -> list[str]:
     remaining = [name for name in discrimination if name not in design.distinguished_effects]
     if remaining:
         lines.append(f"no run of this kind distinguishes it from {', '.join(remaining)}")
-    # The cause that needs the fewest repetitions.
+    # The discrimination of the cause that needs the fewest repetitions of the run.
     best = max((discrimination[name] for name in remaining), default=0.0)
     if best > 0 and (repeats := math.ceil(DISCRIMINATION_THRESHOLD / best)) <= MAX_REPEATS:
         lines.append(f"{repeats} recordings of it would distinguish one more of these")
@@ -247,7 +252,8 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
 
     Linearised values tend to be too high, so a run is proposed only after an exact evaluation. The
     best run that is only linearised is evaluated next; its value then usually falls, and another
-    run is the best one.
+    run is the best one. This is repeated until the best runs are exact or the limit of the ranker
+    is reached.
 
     Args:
         ranker: evaluates runs exactly, by fits of the competing models.
@@ -261,7 +267,8 @@ def _evaluate_fully(ranker: RunRanker, runs: Sequence[RunValue]) -> list[RunValu
             for index, run_value in enumerate(ranked[:PLANS_VARIED_PER_ROUND])
             if not run_value.is_exact
         ]
-        # A run of the largest value that counts cannot be improved.
+        # An exact value of `max_total_value` means that all models are distinguished: no other run
+        # can be better.
         is_best_found = ranked and ranked[0].is_exact and ranked[0].value >= ranker.max_total_value
         if not linearised_indices or is_best_found:
             break
@@ -328,10 +335,11 @@ def _list_other_effects(model: FittedModel, other_model: FittedModel) -> str:
 def _iterate_connected_groups(
     names: Sequence[str], discrimination: Array
 ) -> Iterator[tuple[str, ...]]:
-    """Yield the connected components of the models, linked where a run does not distinguish them.
+    """Yield groups of models that a run does not distinguish, as the names of their members.
 
-    Models of different groups would be distinguished by the run; those of one group might not be.
-    Each group is found by a breadth-first search.
+    Two models are linked if their discrimination is at most `DISCRIMINATION_THRESHOLD`. The groups
+    are the connected components of these links, each found by a breadth-first search. So the run
+    distinguishes models of different groups, but perhaps not those of one group.
 
     Args:
         names: names of N models.

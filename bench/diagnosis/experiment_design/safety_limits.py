@@ -206,8 +206,8 @@ class RigLimits:
     def _is_within_limits(self, channels: Mapping[str, Array]) -> bool:
         """Return whether a simulated run stays within the limits of all monitored channels.
 
-        A run of a robot must also not touch bodies that did not touch each other in the present
-        runs.
+        In a run of a robot, geoms that did not touch each other in the present runs must not touch
+        either.
 
         Args:
             channels: (T,) simulated values by channel. A run with NaN or infinity is rejected.
@@ -216,7 +216,8 @@ class RigLimits:
             if not np.isfinite(values).all():
                 return False
             low, high = self.bounds[name]
-            # A share of an infinite limit would be infinite.
+            # Values that only exceed a limit by rounding errors are allowed. An infinite limit
+            # needs no tolerance, which would be infinite, too.
             is_limited = np.isfinite([low, high]).all()
             tolerance = ROUNDING_TOLERANCE * max(abs(low), abs(high)) if is_limited else 0.0
             if values.min() < low - tolerance or values.max() > high + tolerance:
@@ -232,7 +233,9 @@ class RigLimits:
         return frozenset().union(*(self._find_contacts(run) for run in self.present_runs))
 
     def _find_contacts(self, channels: Mapping[str, Array]) -> frozenset[tuple[int, int]]:
-        """Return the pairs of bodies of the robot that touch in a motion.
+        """Return the pairs of geoms (collision shapes) of the robot that touch in a motion.
+
+        Each pair has the numbers of the geoms in MuJoCo.
 
         Args:
             channels: joint positions of the motion, by channel.

@@ -150,7 +150,7 @@ def fit_base_model(
         The best fit, with insensitive parameters at their nominal values. If it exceeds `max_cost`
         at the beginning of the runs, it is simulated only there.
     """
-    # 1. Starts.
+    # 1. Starts. The base model has no effects, hence the empty tuple.
     thetas = _list_starts(evaluator, initial_base)
     starts = [FitStart((), theta, evaluator.initial_state_guesses) for theta in thetas]
     # Simulating a start costs far less than fitting it, so the starts are reduced first.
@@ -179,8 +179,7 @@ def fit_base_model(
         best = BaseFit(best, frozenset()).refit(evaluator, noise).fit
 
     # 4. Insensitive parameters.
-    # An insensitive parameter is set to nominal, because the value that the search reached means
-    # nothing.
+    # Their fitted values mean nothing, because the data do not depend on them.
     base_indices = evaluator.base_indices.tolist()
     insensitive = frozenset(i for i in base_indices if not _is_sensitive(evaluator, best, i, noise))
     base = BaseFit(best, insensitive)
@@ -248,7 +247,7 @@ def compute_lowest_start_cost(evaluator: RunEvaluator, noise: NoiseModel, share:
         FitStart((), theta, evaluator.initial_state_guesses)
         for theta in _list_starts(evaluator, None)
     ]
-    # A start that fails anywhere has an infinite cost.
+    # With an infinite residual of failed samples, a start that fails anywhere has an infinite cost.
     costs = compute_start_costs(evaluator, noise, starts, share, failed_residual=np.inf)
     return float(costs.min())
 
@@ -317,7 +316,8 @@ def fit_wider(evaluator: RunEvaluator, noise: NoiseModel, base: BaseFit) -> Base
     """Widen the ranges of parameters that are at a bound, and fit the base model again.
 
     A declared range is a guess. If the best value lies outside it, an effect would be fitted to the
-    difference. This is repeated until no parameter is at a bound that physics allows to exceed.
+    difference later, and reported as a cause. This is repeated until no parameter is at a bound
+    that physics allows to exceed.
 
     Args:
         evaluator: the runs for fitting; the ranges of its parameters are replaced.
@@ -349,11 +349,14 @@ def find_start_with_tuner(
         noise: noise of each channel.
         seed: seed of the tuner's random numbers.
 
+    Returns:
+        The best base parameters that the tuner finds within its simulation budget and time limit.
+
     Raises:
         InputError: the tuner does not exist, or must be trained first.
     """
     channels = evaluator.observed.shape[2]
-    # A tuner accepts one table (R T, C), so the runs are concatenated, padded to equal length.
+    # A tuner accepts one table (R T, C), so the R runs, padded to T samples, are concatenated.
     observed = evaluator.observed.reshape(-1, channels)
     parameters = [evaluator.parameters[i] for i in evaluator.base_indices]
     problem = StandaloneProblem(
@@ -382,7 +385,7 @@ def _evaluate_base(
     """Simulate all runs with n sets of base parameters, and return their losses for a tuner.
 
     The loss is the root mean square of the residuals in units of the noise, as in a comparison of
-    tuners; it is infinite if the simulation fails.
+    tuners, with zeros for missing samples; it is infinite if the simulation fails.
 
     Shapes: R runs, padded to T samples, C channels.
 

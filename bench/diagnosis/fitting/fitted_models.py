@@ -115,7 +115,8 @@ class ModelSet:
     def make_rng(self, question: str, names: Iterable[str] = ()) -> np.random.Generator:
         """Return the random generator of a question about a model with the given effects.
 
-        It does not depend on earlier questions, so the answer does not either.
+        A question is one test of the search, such as a score test. The random numbers do not depend
+        on earlier questions, so the answer does not either.
 
         Args:
             question: name of the question.
@@ -167,7 +168,8 @@ class ModelSet:
         Args:
             fit: fit of a model; its cost is infinite if the model could not be simulated.
         """
-        # k of (1): fitted parameters, and initial states that the data determine.
+        # k of (1): fitted parameters, and the effective number of initial states that the data
+        # determine.
         freedom = fit.free_indices.size + count_identified_states(self.evaluator, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
         likelihood = FAILED_LIKELIHOOD
@@ -195,7 +197,8 @@ class ModelSet:
     def score_unmodelled_force(self, model: FittedModel) -> tuple[float, str] | None:  # noqa: ARG002
         """Return the p-value of the best additional force and the signal that the force depends on.
 
-        Here always None: the test for unmodelled forces uses simulations.
+        Here always None, since only a subclass with a Kalman filter has this test; without it, the
+        test for unmodelled forces uses simulations.
         """
         return None
 
@@ -254,9 +257,8 @@ class ModelSet:
         # 1. Stages.
         if is_staged:
             starts = self._select_promising_starts(starts, noise)
-        # 2. Fits.
-        # With noise weights other than those of the stored fits, sums of squares could not be
-        # compared with theirs.
+        # 2. Fits. Sums of squares with noise weights other than `self.noise` cannot be compared
+        # with those of the stored fits, so then no fit is stopped early.
         is_race = is_racing and noise is self.noise
         lowest_cost = self._find_lowest_cost(starts) if is_race else np.inf
         fitter = TrajectoryFitter(self.evaluator, noise, self.fixed_parameters)
@@ -266,7 +268,8 @@ class ModelSet:
         ):
             # 3. Storage.
             self.add_fit(fit)
-        # A fit that was stopped early is stored, but not evaluated.
+        # If the search has to end, fits may have been stopped early. They are stored above, and the
+        # search ends here, before conclusions are drawn from them.
         control.check_not_stopped()
         self._report_best()
 
@@ -305,6 +308,7 @@ class ModelSet:
         )
         if base is None or best is None or not best.effects:
             return
+        # Share of the excess of the base model that the best model removes.
         gap = self.compute_excess_residual(base)
         if gap > 0 and np.isfinite(gap):
             share = 1.0 - max(self.compute_excess_residual(best), 0.0) / gap
@@ -323,7 +327,8 @@ class ModelSet:
         # A model that could not be simulated has no derivatives.
         if model.fit.is_own_jacobian or not np.isfinite(model.fit.cost):
             return model
-        # The stored model may be the same fit, whose derivatives were computed earlier.
+        # The stored model may be this fit, for which the derivatives were computed in an earlier
+        # call.
         stored_model = self.models.get(frozenset(model.effects))
         if (
             stored_model is not None
@@ -365,9 +370,8 @@ class ModelSet:
             likelihood = model.likelihood
             if not np.isfinite(model.fit.cost):
                 break
-            # 1. Noise.
-            # A channel without samples has no noise, and a channel without noise would have
-            # infinite weight.
+            # 1. Noise. A channel without samples has no estimate, so that of the recording is used.
+            # A channel without noise would have infinite weight, hence the minimum.
             sigma = np.where(np.isfinite(likelihood.sigma), likelihood.sigma, self.noise.sigma)
             noise = NoiseModel(
                 np.maximum(sigma, MIN_SIGMA_SHARE * self.noise.sigma), likelihood.phi
@@ -407,7 +411,7 @@ class ModelSet:
             noise: noise of each channel.
         """
         remaining_starts = list(starts)
-        # Patient fits keep all candidates at first, but only a few may be fitted to whole runs.
+        # Fits to longer parts take longer, so fewer models continue after each horizon.
         for horizon, count in zip(FIT_HORIZONS[:-1], MODELS_KEPT_PER_HORIZON, strict=True):
             fitter = TrajectoryFitter(self.evaluator, noise, self.fixed_parameters, horizon.share)
             fits = fitter.fit_models(remaining_starts, horizon.iterations)

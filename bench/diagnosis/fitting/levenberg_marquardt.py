@@ -338,12 +338,12 @@ class FitState:
         )
         return self.has_unreliable_states or (is_slow and not self._is_far(self.point.cost))
 
-    def _ask_for_own_states(self) -> bool:
+    def _mark_unreliable_state_jacobian(self) -> bool:
         """Mark the derivatives by initial states as unreliable if the shared ones may be wrong.
 
-        Then the fit gets its own before the next step. Where a joint sticks, it keeps an error of
-        its initial position, but the derivatives that all models share let this error decay. They
-        may be wrong if
+        Then the fit computes its own about its present model before the next step. Where a joint
+        sticks, it keeps an error of its initial position, but the derivatives that all models share
+        let this error decay. They may be wrong if
 
         * the model has dry friction, so that joints may stick;
         * the residual is neither pure noise nor very large, so that this error may be the cause;
@@ -363,7 +363,7 @@ class FitState:
 
     def end(self) -> None:
         """End the fit, unless derivatives by initial states about its own model may improve it."""
-        self.is_finished = not self._ask_for_own_states()
+        self.is_finished = not self._mark_unreliable_state_jacobian()
 
     def get_tolerance(self, cost: float) -> float:
         """Return the decrease of the cost by a step below which the fit has converged.
@@ -371,6 +371,9 @@ class FitState:
         It has an absolute part in units of the noise variance, and a share of the `cost` (the sum
         of squares), which is larger if the model is far from the data. A fit whose parameters are
         reported has only a smaller absolute part.
+
+        Args:
+            cost: cost after the step, eq. (1) of the module docstring.
         """
         if self.is_final_fit:
             return ROUGH_FINAL_TOLERANCE if self.has_rough_cost else FINAL_CONVERGENCE_TOLERANCE
@@ -385,7 +388,10 @@ class FitState:
         return self.has_rough_cost and cost > FAR_MEAN_SQUARE * self.sample_count
 
     def _is_rough_at(self, decrease: float) -> bool:
-        """Return whether the cost is not smooth at the scale of a decrease."""
+        """Return whether the cost is not smooth at the scale of a decrease (only that of robots).
+
+        It has small jumps, for example where a joint sticks one integration step later.
+        """
         return self.has_rough_cost and decrease < (
             EXACT_ROUGHNESS if self.is_final_fit else ROUGHNESS
         )
@@ -446,7 +452,8 @@ class FitState:
         )
         scaled_displacement = displacement / np.square(self.steps)
         squared_length = np.sum(scaled_displacement * displacement, axis=1)
-        # A run in which nothing was moved gives no information.
+        # A run in which nothing was moved gives no information; the infinite divisor makes its
+        # update zero.
         broyden_weights = (
             scaled_displacement / np.where(squared_length > 0, squared_length, np.inf)[:, None]
         )
@@ -483,17 +490,19 @@ class FitState:
         # The minimum avoids a division by zero.
         gain_ratio = decrease / max(self.predicted_decrease, 1e-300)  # (7)
         is_predicted = abs(gain_ratio - 1.0) <= JACOBIAN_REUSE_TOLERANCE
-        # `has_own_jacobian` is about the new point: updated derivatives serve for another step
-        # only if this step was predicted well.
+        # `has_own_jacobian` is about the new point. It is false if its derivatives were updated and
+        # not computed; such derivatives serve for another step only if this step was predicted
+        # well.
         self.is_jacobian_stale = not self.has_own_jacobian and not is_predicted
         self.damping = float(reduce_damping(self.damping, gain_ratio))
         self.growth = INITIAL_DAMPING_GROWTH
-        # Far from the data, the fit hardly gains any more.
+        # Far from the data, a fit whose steps gain much less than predicted, and little of the
+        # cost, is not worth continuing.
         is_stagnant = gain_ratio < STAGNANT_RATIO and decrease < STAGNANT_SHARE * cost
         if is_own_jacobian and not self.is_final_fit and is_stagnant and self._is_far(cost):
             self.is_finished = True
-        # Even exact derivatives did not predict this step: the cost is too rough at the scale of
-        # the remaining gain.
+        # Even derivatives of the point where the step began did not predict it: the cost is too
+        # rough at the scale of the remaining gain.
         largest = max(decrease, self.predicted_decrease)
         if is_own_jacobian and not is_predicted and self._is_rough_at(largest):
             self.end()
@@ -515,7 +524,7 @@ class FitState:
             decreases: (R, C) decrease of the squared residual of each channel by the step.
             is_moved: (R,) mask of the runs that take the step.
         """
-        # Decrease of the squared residual of the channels of each state, (R, s).
+        # Sums (R, s) of the decreases over the channels of each state.
         predicted = self.predicted_decreases @ self.channels_of_states
         actual = decreases @ self.channels_of_states
         # A simulation that was abandoned or diverged has no finite decrease.
@@ -546,7 +555,7 @@ class FitState:
             self.is_jacobian_stale = True
             return
         # This marks the derivatives by initial states for recomputing if they may be wrong.
-        if self._ask_for_own_states():
+        if self._mark_unreliable_state_jacobian():
             return
         # 2. Rough cost.
         if self._is_rough_at(self.predicted_decrease):
@@ -720,6 +729,7 @@ class _ArrowheadEquations:
         # Right-hand side of (4).
         right_hand_side = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
 
+        # Step (q,) of the parameters; blocked ones do not move.
         parameter_step = np.zeros(len(right_hand_side))
         is_free = ~blocked_mask
         if is_free.any():
@@ -810,8 +820,8 @@ def _apply_damping(
 def hold_known_states(inner: Array, cross: Array, known_mask: Mask) -> tuple[Array, Array]:
     """Fix known initial states in the normal equations of a Gauss-Newton step.
 
-    The equation of a known state becomes: its step is zero. No parameter and no other state is
-    coupled to it. The caller sets the right-hand side of this equation to zero.
+    The equation of a known state becomes dz = 0: no parameter and no other state is coupled to its
+    step dz. The caller sets the right-hand side of this equation to zero.
 
     Shapes: R runs, q fitted parameters, s states of a run.
 
@@ -823,7 +833,8 @@ def hold_known_states(inner: Array, cross: Array, known_mask: Mask) -> tuple[Arr
     Returns:
         The changed V_i and W_i.
     """
-    # Elements in the row or the column of a known state become those of the identity matrix.
+    # Elements in the row or the column of a known state become those of the identity matrix, so
+    # that V stays invertible.
     is_coupled = known_mask[:, :, None] | known_mask[:, None, :]
     decoupled = np.where(is_coupled, np.eye(inner.shape[1]), inner)
     return decoupled, np.where(known_mask[:, None, :], 0.0, cross)

@@ -66,7 +66,8 @@ def make_segment_evaluator(evaluator: RunEvaluator) -> RunEvaluator | None:
 def _split_run(run: Run) -> list[Run]:
     """Split a run into segments of equal length, or return it whole if one is too sparse.
 
-    A segment is too sparse if it has less than half of `MIN_MEAN_SEGMENT_SAMPLES` samples.
+    The number of segments is the largest for which they have `MIN_MEAN_SEGMENT_SAMPLES` samples on
+    average, up to `SEGMENTS_PER_RUN`. One that has less than half of these samples is too sparse.
 
     Args:
         run: recorded run.

@@ -179,7 +179,8 @@ def compute_central_jacobian(
     bounds = _widen_bounds(evaluator, fit)
     ranges = bounds[:, 1] - bounds[:, 0]
     steps = compute_difference_steps(fit.jacobian, noise, ranges)
-    # Derivatives by initial states from a linearisation are no differences, so they are kept.
+    # A robot's derivatives by initial states come from a linearisation and not from differences, so
+    # they are kept, and only parameters are displaced.
     if evaluator.has_linearisation:
         steps = steps[:parameter_count]
     theta, states = _displace_both_sides(fit, steps, bounds)
@@ -190,8 +191,8 @@ def compute_central_jacobian(
     )
     lower_side, upper_side = simulated.reshape(2, steps.size, *fit.simulated.shape)
 
-    # A parameter at a bound moves by less than its step. Row j has changed parameter j, so the
-    # actual widths are on the diagonal of these (q, q) values of both sides.
+    # Distances between both sides. A parameter at a bound moves by less than its step. Row j has
+    # changed parameter j, so its distance is on the diagonal of these (q, q) values of both sides.
     lower, upper = theta[:, :parameter_count, fit.free_indices]
     parameter_widths = np.diagonal(upper - lower)
     widths = np.concatenate([parameter_widths, 2.0 * steps[parameter_count:]])
@@ -314,8 +315,8 @@ def get_linearisation(
 ) -> RunLinearisation:
     """Return the dynamics of a robot linearised along one run, at given parameters.
 
-    The most recently used linearisations are cached, as many as there are runs, because most are
-    used more than once.
+    The most recently used linearisations are cached in the evaluator, as many as there are runs,
+    because most are used more than once.
 
     Shapes: P parameters, s states of a run.
 
@@ -342,7 +343,8 @@ def get_linearisation(
             states[coordinate_count:],
         )
     cache[key] = linearisation
-    # The cache is ordered by the last use. Drop the linearisations unused for the longest time.
+    # A used entry was removed above and is added again at the end, so the cache is ordered by the
+    # last use. Drop the linearisations unused for the longest time.
     for oldest_key in list(cache)[: -len(evaluator.prepared_runs)]:
         del cache[oldest_key]
     return linearisation

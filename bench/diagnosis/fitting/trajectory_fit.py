@@ -90,12 +90,12 @@ def iterate_rounds(iterations: int, is_racing: bool) -> Iterator[RacingRound]:
 def eliminate_losing_fits(fit_states: Sequence[FitState], lowest_cost: float) -> None:
     """Mark fits as finished if several more steps would not bring them close to the best cost.
 
-    The cost is the sum of squares. The decrease that a fit may still reach is taken as a multiple
-    of the decrease that was predicted for its last step.
+    The cost is the sum of squares in units of the noise. The decrease that a fit may still reach is
+    taken as a multiple of the decrease that was predicted for its last step.
 
     Args:
         fit_states: states of the fits; `is_finished` is set in place.
-        lowest_cost: lowest cost of other fits.
+        lowest_cost: lowest cost of fits that are not among `fit_states`.
     """
     best = min(lowest_cost, *(fit_state.point.cost for fit_state in fit_states))
     for fit_state in fit_states:
@@ -177,7 +177,8 @@ class TrajectoryFitter:
             unfinished = [i for i, fit_state in enumerate(fit_states) if not fit_state.is_finished]
             if not unfinished:
                 break
-            # The first round is always made, because it simulates the starts.
+            # The first round, which begins with iteration 0, is always made, because it simulates
+            # the starts.
             if racing_round.first and self.evaluator.search_control.should_abandon_fit(
                 racing_round.first / iterations
             ):
@@ -241,13 +242,14 @@ class TrajectoryFitter:
             return [list(unfinished)]
         run_count, length, _ = evaluator.observed.shape
         state_count = self._list_displaced_states().size
-        # Batch elements of a step: each run of each fit, without and with each unknown displaced.
+        # Batch elements of a step: each run of each fit, once without a displacement and once with
+        # each unknown displaced, as finite differences need.
         element_count = (
             sum(1 + fit_states[i].free_indices.size + state_count for i in unfinished) * run_count
         )
         cost = element_count * length * self.share + ALGEBRA_COST_SAMPLES * len(unfinished)
-        # The engine steps the elements of a call in parallel, so a group has enough of them,
-        # however long they are.
+        # The number of groups is limited, so that each has about `MIN_CHUNK_SIZE` elements or more,
+        # however long they are: the engine steps the elements of a call in parallel.
         group_count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, element_count / MIN_CHUNK_SIZE)))
         step_kinds = evaluator.group_compatible(
             np.stack([fit_states[i].point.start.theta for i in unfinished])
@@ -301,12 +303,14 @@ class TrajectoryFitter:
             trials = list(self._propose_trials(fit_states, sample_mask))
             if not trials:
                 # Fits that wait for derivatives continue in a later iteration.
-                if any(p.is_waiting and not p.is_finished for p in fit_states):
+                if any(fit.is_waiting and not fit.is_finished for fit in fit_states):
                     continue
                 break
-            # The caller checks whether the fit was stopped early here.
+            # The search has to end, at its deadline for example. The caller checks whether a fit
+            # was stopped early here.
             if self.evaluator.search_control.should_abandon_fit(iteration / racing_round.all):
                 break
+            # If derivatives are updated, a trial point needs a single simulation.
             simulate_points = (
                 self._simulate_without_derivatives
                 if self._updates_derivatives
@@ -330,24 +334,25 @@ class TrajectoryFitter:
             fit_states: states of the fits, changed in place.
             sample_mask: (R, T, C) samples that count in the cost.
         """
-        known_states = [p for p in fit_states if self._has_derivatives(p)]
-        unknown_states = [p for p in fit_states if not self._has_derivatives(p)]
+        known_fits = [fit for fit in fit_states if self._has_derivatives(fit)]
+        unknown_fits = [fit for fit in fit_states if not self._has_derivatives(fit)]
         # 1. Without known derivatives.
-        if unknown_states:
+        if unknown_fits:
             points = self._simulate_points(
-                [(p, p.point.start) for p in unknown_states], sample_mask
+                [(fit, fit.point.start) for fit in unknown_fits], sample_mask
             )
-            for fit_state, point in zip(unknown_states, points, strict=True):
+            for fit_state, point in zip(unknown_fits, points, strict=True):
                 self._move_to_point(fit_state, point)
         # 2. With known derivatives.
-        if known_states:
+        if known_fits:
             points = self._simulate_without_derivatives(
-                [(p, p.point.start) for p in known_states], sample_mask
+                [(fit, fit.point.start) for fit in known_fits], sample_mask
             )
-            for fit_state, point in zip(known_states, points, strict=True):
+            for fit_state, point in zip(known_fits, points, strict=True):
                 known_jacobian = point.start.known_jacobian
                 assert known_jacobian is not None
-                # Only the first part of each run may be simulated.
+                # Known derivatives are those of whole runs, of which only the first part may be
+                # simulated here.
                 sample_count = point.simulated.shape[1]
                 state_jacobian = self._get_state_derivatives(fit_state, point.start, sample_count)
                 jacobian = np.concatenate(
@@ -358,7 +363,7 @@ class TrajectoryFitter:
 
     @property
     def _updates_derivatives(self) -> bool:
-        """True if accepted steps update derivatives instead of recomputing them.
+        """True if accepted steps update derivatives (Broyden) instead of recomputing them.
 
         Half of the trial points are rejected, and updated derivatives serve for several steps. For
         initial states alone, and where each call of the engine is slow, it would not save time.
@@ -369,7 +374,8 @@ class TrajectoryFitter:
     def _has_derivatives(self, fit_state: FitState) -> bool:
         """Return whether the derivatives by all fitted parameters are known near the start.
 
-        This saves one simulation per parameter. Only robots reuse derivatives.
+        This saves one simulation per parameter. Only robots without contacts, which have a
+        linearisation, reuse derivatives.
         """
         known_jacobian = fit_state.point.start.known_jacobian
         return (
@@ -385,7 +391,8 @@ class TrajectoryFitter:
 
         Others continue with Broyden's updates, which need no simulations. A robot's derivatives by
         initial states are those of the base model, which all models share, until a fit needs its
-        own (`needs_own_state_jacobian`); these are then computed first.
+        own (`needs_own_state_jacobian`), because the shared ones are not good enough; these are
+        then computed first, by a linearisation. Derivatives by parameters are finite differences.
 
         Shapes: R runs, T samples, C channels.
 
@@ -395,14 +402,16 @@ class TrajectoryFitter:
             includes_waiting: whether to include fits that may have converged, whose derivatives
                 are only needed if they are not far behind other fits.
         """
-        stale_states = [
-            p
-            for p in fit_states
-            if p.is_jacobian_stale and not p.is_finished and (includes_waiting or not p.is_waiting)
+        stale_fits = [
+            fit
+            for fit in fit_states
+            if fit.is_jacobian_stale
+            and not fit.is_finished
+            and (includes_waiting or not fit.is_waiting)
         ]
-        if not stale_states:
+        if not stale_fits:
             return
-        for fit_state in stale_states:
+        for fit_state in stale_fits:
             fit_state.jacobian_renewals += 1
             if fit_state.needs_own_state_jacobian:
                 if fit_state.has_unreliable_states:
@@ -413,8 +422,8 @@ class TrajectoryFitter:
                 )
                 fit_state.own_state_cost = fit_state.point.cost
                 fit_state.has_unreliable_states = False
-        points = self._simulate_points([(p, p.point.start) for p in stale_states], sample_mask)
-        for fit_state, point in zip(stale_states, points, strict=True):
+        points = self._simulate_points([(fit, fit.point.start) for fit in stale_fits], sample_mask)
+        for fit_state, point in zip(stale_fits, points, strict=True):
             self._move_to_point(fit_state, point)
 
     def _replace_first_states(self, fit_state: FitState, sample_mask: Mask) -> None:
@@ -481,9 +490,11 @@ class TrajectoryFitter:
             state_growth=np.full(start.initial_states.shape, INITIAL_DAMPING_GROWTH),
             predicted_decreases=np.zeros((len(start.initial_states), len(evaluator.channels))),
             is_final_fit=self.is_final_fit,
+            # The cost of a robot is not smooth at the scale of the noise.
             has_rough_cost=evaluator.has_linearisation,
             sample_count=int(evaluator.get_sample_mask(self.share).sum()),
             own_state_jacobian=start.state_jacobian,
+            # Whether dry friction may hold a joint at rest.
             can_stick=evaluator.has_linearisation and _can_stick(evaluator, start.effects),
         )
 
@@ -731,7 +742,7 @@ class TrajectoryFitter:
             sample_mask: (R, T, C) samples that count in the cost.
         """
         point = fit_state.point
-        # There is no descent direction from a point that could not be simulated.
+        # A point that could not be simulated has an infinite cost, and no descent direction.
         if not np.isfinite(point.cost):
             fit_state.is_finished = True
             return None
@@ -788,6 +799,7 @@ class TrajectoryFitter:
             sample_mask: (R, T, C) samples that count in the cost.
         """
         has_worse_runs = False
+        # Only initial states of a robot are fitted.
         if fit_state.fits_rough_states:
             point, has_worse_runs = self._step_improved_runs(fit_state, point, sample_mask)
         decrease = fit_state.point.cost - point.cost

@@ -155,7 +155,11 @@ class Columns:
                 )
 
     def subset(self, chosen: Sequence[int]) -> Columns:
-        """Return some of the candidates, with the columns of all."""
+        """Return some of the candidates; the columns of all are kept, so that indices stay valid.
+
+        Args:
+            chosen: indices of these candidates.
+        """
         indices = list(chosen)
         probes = tuple(self.probes[i] for i in indices)
         return replace(
@@ -211,6 +215,10 @@ def compute_columns(followed: FollowedRuns, probes: Sequence[CandidateDirection]
     Args:
         followed: the runs, followed by the filter about whose motion the inputs are computed.
         probes: the candidates: effects with trial coefficients.
+
+    Returns:
+        The columns, and for each candidate the index of its column and the trial value of its
+        scaling coefficient, by which its response is divided later.
     """
     # The effect of each column, with its coefficients.
     effects: list[tuple[Effect, Array]] = []
@@ -242,7 +250,8 @@ def compute_columns(followed: FollowedRuns, probes: Sequence[CandidateDirection]
         for begin in range(0, max(len(effects), 1), COLUMNS_PER_BATCH)
     ]
     inputs, readings = (SparseSignals.join(parts) for parts in zip(*batches, strict=True))
-    # A candidate that is valid at one size only is not divided by it.
+    # The response to a candidate that is valid at one size only, such as an end stop, is not
+    # proportional to its coefficient, so it is not divided by it.
     sizes = np.array(
         [1.0 if p.is_single_size else p.coefficients[p.coefficient_index] for p in probes]
     )

@@ -154,7 +154,7 @@ def smooth_first_states(
     if not can_filter(evaluator, theta):
         return None
     runs, share_count = range(len(evaluator.prepared_runs)), len(FORCE_SHARES)
-    # The hypotheses of a run follow one another.
+    # The hypotheses of a run, one for each size of the missing force, follow one another.
     results = filter_hypotheses(
         evaluator,
         sigma,
@@ -198,7 +198,10 @@ def _refine_first_state(
         theta: (P,) parameters of the model.
         sigma: (C,) standard deviation of the noise of each channel.
         run: index of the run.
-        smoothed: result of the smoother for this run.
+        smoothed: result of the smoother for this run: mean and covariance of its first state.
+
+    Returns:
+        Positions, then velocities of D joints; the smoothed mean if no better state is found.
     """
     is_recorded = np.isfinite(evaluator.observed[run])
     # A fixed seed, so that the result depends only on the arguments.
@@ -303,12 +306,13 @@ class _CubatureFilters:
         Each hypothesis gets its controls, forces, first state with prior, and readings. The batch
         of the engine gets the effects of each hypothesis once per cubature point.
 
-        For F hypotheses and D joints, `_start` and `_prior` (F, 2 D) are the guessed first states
-        and their standard deviations, `_controls` and `_forces` the inputs of each step, and
-        `_force_deviations` (F, D) the standard deviations of the missing forces. `_knots` (T,) are
-        the numbers of the steps at which the samples lie, `_observed` (F, T, m) the readings of the
-        m recorded components of the state, `_rows` the indices of these components, and
-        `_variances` (m,) their noise.
+        For F hypotheses and D joints, `_first_means` and `_first_deviations` (F, 2 D) are the
+        guessed first states and their prior standard deviations, `_controls` and `_forces` the
+        inputs of each step, and `_force_deviations` (F, D) the standard deviations of the missing
+        forces. `_sample_steps` (T,) are the numbers of the steps at which the samples lie,
+        `_readings` (F, T, m) the readings of the m recorded components of the state,
+        `_observed_components` the indices of these components, and `_noise_variances` (m,) the
+        variances of their noise.
 
         Args:
             evaluator: the runs.
@@ -320,7 +324,7 @@ class _CubatureFilters:
         assert isinstance(simulator, RobotSimulator)
         joints = len(simulator.addresses.positions)
         # The state consists of positions and velocities.
-        self._joints, self._size = joints, 2 * joints
+        self._joint_count, self._state_size = joints, 2 * joints
         self._point_count = count_cubature_points(joints)
         acting = simulator.get_active_effects(np.array([h.theta for h in hypotheses]))
         typical = compute_joint_scales(simulator.robot).force
@@ -330,7 +334,7 @@ class _CubatureFilters:
             run_data = evaluator.prepared_runs[hypothesis.run]
             start, prior = _guess_first_state(evaluator, sigma, hypothesis.run)
             own_effects = slice_active_effects(acting, np.array([index]))
-            work = RobotRunBatch(
+            run_batch = RobotRunBatch(
                 run_data.scenario,
                 simulator.run_inputs(run_data.scenario),
                 own_effects,
@@ -338,32 +342,37 @@ class _CubatureFilters:
                 start[None, joints:],
             )
             # A batch of one run, hence the index 0.
-            inputs = simulator.compute_controls(work, simulator.count_steps(work.times) + 1)
+            step_count = simulator.count_steps(run_batch.times) + 1
+            inputs = simulator.compute_controls(run_batch, step_count)
             controls.append(inputs.controls[0])
             forces.append(inputs.forces[0])
             starts.append(start)
             priors.append(prior)
         self._controls, self._forces = np.array(controls), np.array(forces)
-        self._start, self._prior = np.array(starts), np.array(priors)
+        self._first_means, self._first_deviations = np.array(starts), np.array(priors)
         # Sample times and added elements of all hypotheses are equal, so those of the last one
         # serve.
-        self._knots = np.rint(work.times / simulator.time_step).astype(np.intp)
+        self._sample_steps = np.rint(run_batch.times / simulator.time_step).astype(np.intp)
         self._mujoco_batch = simulator.make_linearisation_batch(own_effects)
-        # Index of the hypothesis of each element of the engine's batch. One hypothesis may need
-        # several batches, whose elements all have its effects.
+        # Index of the hypothesis of each element of the engine's batch: one element for each
+        # cubature point. If the points of a single hypothesis exceed the batch, they are stepped in
+        # several parts, so the index is cut to the size of the batch.
         elements = np.repeat(np.arange(len(hypotheses)), self._point_count)[
             : self._mujoco_batch.count
         ]
-        # Effects that change numbers of the model, such as a friction.
-        written = slice_active_effects(select_model_field_effects(acting), elements)
-        self._acting = pad_coefficients(written, elements.size, self._mujoco_batch.count)
+        # Effects that change numbers of the model, such as a friction, for each element. Elements
+        # of the batch that are not in use have coefficients of zero.
+        field_effects = slice_active_effects(select_model_field_effects(acting), elements)
+        self._field_effects = pad_coefficients(
+            field_effects, elements.size, self._mujoco_batch.count
+        )
         names = [*simulator.system.coordinates, *simulator.system.rates]
         # Recorded components of the state: their channels, and their rows in the state.
         columns = [i for i, name in enumerate(evaluator.channels) if name in names]
-        self._rows = [names.index(evaluator.channels[i]) for i in columns]
+        self._observed_components = [names.index(evaluator.channels[i]) for i in columns]
         data_of_runs = [evaluator.prepared_runs[h.run] for h in hypotheses]
-        self._observed = np.array([run_data.observed[:, columns] for run_data in data_of_runs])
-        self._variances = np.square(sigma[columns])
+        self._readings = np.array([run_data.observed[:, columns] for run_data in data_of_runs])
+        self._noise_variances = np.square(sigma[columns])
 
     def smooth(self) -> list[SmoothedStart]:
         """Filter the runs forward, smooth them backward, and return the first states.
@@ -376,16 +385,16 @@ class _CubatureFilters:
         Returns:
             The result of each hypothesis; the log-likelihood of a filter that diverges is -inf.
         """
-        mean = self._start.copy()
-        covariance = np.square(self._prior)[:, :, None] * np.eye(self._size)
+        mean = self._first_means.copy()
+        covariance = np.square(self._first_deviations)[:, :, None] * np.eye(self._state_size)
         log_likelihood = np.zeros(len(mean))
         has_failed = np.zeros(len(mean), dtype=bool)
         intervals: list[_IntervalMoments] = []
-        last_sample = self._knots.size - 1
+        last_sample = self._sample_steps.size - 1
         with np.errstate(all="ignore"), capture_mujoco_warnings():
-            self._mujoco_batch.write_effects(self._acting)
+            self._mujoco_batch.write_effects(self._field_effects)
             # 1. Forward.
-            for i in range(self._knots.size):
+            for i in range(self._sample_steps.size):
                 log_likelihood_gain, mean, covariance = self._update(i, mean, covariance)
                 log_likelihood += log_likelihood_gain
                 if i < last_sample:
@@ -419,7 +428,7 @@ class _CubatureFilters:
         Returns:
             Means and covariances of the states at both samples.
         """
-        size, component_count = self._size, self._point_count // 2
+        size, component_count = self._state_size, self._point_count // 2
         added_covariance = ADDED_VARIANCE * np.eye(size)
         # Points (2 n, n) in units of the standard deviations, of which the last D are forces.
         points = np.sqrt(component_count) * np.concatenate(
@@ -428,12 +437,12 @@ class _CubatureFilters:
         root = compute_root(covariance + added_covariance)
         displacements = points[:, :size] @ root.swapaxes(1, 2)  # (1)
         missing_forces = points[:, size:] * self._force_deviations[:, None]
-        begin, end = self._knots[i : i + 2].tolist()
+        begin, end = self._sample_steps[i : i + 2].tolist()
         ends = self._propagate(mean[:, None] + displacements, missing_forces, begin, end)
         has_failed |= ~np.isfinite(ends).all(axis=(1, 2))
         # A diverged filter must not spread numbers that are not finite; its result is discarded.
         ends[has_failed] = 0.0
-        # Moments of the propagated points.
+        # Mean and covariances of the propagated points, all of which have the same weight.
         predicted = ends.mean(axis=1)
         deviations = ends - predicted[:, None]
         predicted_covariance = deviations.swapaxes(1, 2) @ deviations / ends.shape[1]
@@ -454,14 +463,14 @@ class _CubatureFilters:
         Returns:
             Log-likelihoods of the readings (F,), means, and covariances.
         """
-        readings, rows = self._observed[:, i], self._rows
+        readings, rows = self._readings[:, i], self._observed_components
         is_recorded = np.isfinite(readings)
-        # A missing reading has the observation matrix 0, the residual 0 and the variance 1, so that
-        # it changes neither state nor likelihood.
+        # A missing reading has a zero row in the observation matrix, the residual 0 and the
+        # variance 1, so that it changes neither state nor likelihood.
         residual = np.where(is_recorded, readings - mean[:, rows], 0.0)
         # Covariance H P of the readings with the state, with the observation matrix H.
         observed_covariance = is_recorded[:, :, None] * covariance[:, rows]
-        variances = np.where(is_recorded, self._variances, 1.0)
+        variances = np.where(is_recorded, self._noise_variances, 1.0)
         # H P H' + R
         innovation_covariance = observed_covariance[:, :, rows] * is_recorded[
             :, None, :
@@ -479,8 +488,8 @@ class _CubatureFilters:
     def _propagate(self, states: Array, forces: Array, begin: int, end: int) -> Array:
         """Step states (F, n, 2 D) with additional forces (F, n, D) through the engine.
 
-        There are F hypotheses with n cubature points and D joints. All F n states are stepped in
-        batches of the size that the engine has.
+        There are F hypotheses with n cubature points each and D joints. All F n states are stepped
+        in batches of the size that the engine has.
 
         Args:
             states: positions, then velocities.
@@ -494,7 +503,7 @@ class _CubatureFilters:
         # Two samples may lie in the same step.
         if end == begin:
             return states.copy()
-        joints, mujoco_batch = self._joints, self._mujoco_batch
+        joints, mujoco_batch = self._joint_count, self._mujoco_batch
         position_columns = mujoco_batch.file_joints.positions
         velocity_columns = mujoco_batch.file_joints.velocities
         # The index of the hypothesis of each state selects its controls and recorded forces.
@@ -519,6 +528,7 @@ class _CubatureFilters:
             # The states after the last step.
             result[part, :joints] = motion["qpos"][:, -1, position_columns]
             result[part, joints:] = motion["qvel"][:, -1, velocity_columns]
+            # `result[part]` is a view, because `part` is a slice.
             result[part][mujoco_batch.failed[:count]] = np.nan
         return result.reshape(states.shape)
 
@@ -606,6 +616,11 @@ def _compute_speed_deviation(evaluator: RunEvaluator, sigma: Array, joint: int) 
     It is a few times the noise of the velocity channel or, without one, that of positions per
     sample interval. It is needed since a velocity that a contact stops within a sample interval
     leaves no trace in the readings.
+
+    Args:
+        evaluator: the runs, in which the position or the velocity of the joint is recorded.
+        sigma: (C,) standard deviation of the noise of each channel.
+        joint: index of the joint.
     """
     system, channels = evaluator.simulator.system, list(evaluator.channels)
     coordinate, rate = system.coordinates[joint], system.rates[joint]

@@ -148,6 +148,10 @@ class LinearRuns:
             maps: linear model of each run, whose arrays have the names `STACKED`.
             observed: (R, T, C) readings, NaN where nothing was recorded.
             prior: (Z,) standard deviations of the first states.
+
+        Returns:
+            The models, with the residuals (recorded minus predicted readings) and the mask of what
+            was recorded.
         """
         runs, samples, _ = observed.shape
         stacked: dict[str, Array] = {}
@@ -368,7 +372,8 @@ def fit_process_noise(
         without the covariances of the states.
     """
     count = force.size
-    # Short segments in parallel need fewer steps, and show the same process noise.
+    # All runs are filtered in parallel, sample by sample, so short segments need fewer steps than
+    # long runs. They show the same process noise.
     is_long = runs.residuals.shape[1] > 2 * SEGMENT_SAMPLES
     fitted_runs = runs.segments(SEGMENT_SAMPLES) if is_long else runs
     log_likelihood = -np.inf
@@ -398,7 +403,7 @@ def _make_contiguous(*arrays: Array) -> tuple[Array, ...]:
 
 
 def _complete_deviations(force: Array, runs: LinearRuns) -> Array:
-    """Return the deviations (R, B) of the forces of all columns of G, including coloured noise.
+    """Return standard deviations (R, B) for all columns of G, including those of coloured noise.
 
     Args:
         force: (E,) or (R, E) standard deviations of the missing forces.
@@ -441,12 +446,13 @@ def run_filter(
 ) -> None:
     """Filter B runs of T samples with Z states, C channels and E forces (Kalman filter).
 
-    The deviation δ of the state is that from the motion about which the model is linear. With δ-
-    and P- its prediction and the covariance of that, each sample has (eqs. (1) to (4) of the module
-    docstring)
+    The deviation δ of the state is that from the motion about which the model is linear, δ- its
+    prediction, and P- the covariance of δ-. Each sample has an innovation e with the covariance S
+    and its Cholesky factor L, a whitener W, a gain K, and a part of the log-likelihood ℓ, whose
+    constant is left out (eqs. (1) to (4) of the module docstring):
 
         e = r - H δ-,    S = H P- Hᵀ + R = L Lᵀ,    W = L⁻¹,    K = P- Hᵀ Wᵀ W
-        log L -= log det L + |W e|² / 2
+        ℓ ← ℓ - log det L - |W e|² / 2
 
     After each sample but the last, the state is updated by the reading, and that of the next sample
     is predicted:
@@ -474,7 +480,7 @@ def run_filter(
         innovations: e (B, T, C).
         gains: K (B, T, Z, C).
         whiteners: W (B, T, C, C).
-        likelihood: log L (B,).
+        likelihood: log-likelihood ℓ (B,) of each run.
         x: (Z,) deviation of the state.
         moved: (Z,) deviation of the next state.
         p: (Z, Z) covariance of the state.
@@ -483,9 +489,10 @@ def run_filter(
         root: (C, C) Cholesky factor L of S.
         inverse: (C, C) inverse of L.
         crossed: (C, Z) H P.
-        half: (C, Z) L⁻¹ H P.
+        half: (C, Z) W H P.
         w: (C,) whitened innovation.
     """
+    # Indices: z and y of states, c and d of channels, e of forces, i of samples, k of a sum.
     runs, samples, channels, size = readings.shape
     count = forces.shape[3]
     for run in range(runs):
@@ -581,6 +588,7 @@ def run_filter(
                     # `not` also finds NaN.
                     if not abs(value) < limits[0]:
                         is_lost = True
+            # Nothing is known about a lost state: its standard deviation is at least 1 in SI units.
             if is_lost:
                 for z in range(size):
                     for y in range(size):
@@ -614,9 +622,10 @@ def run_smoother(
 ) -> None:
     """Smooth B runs of T samples with Z states, C channels and E forces (Bryson and Frazier).
 
-    Backward from the last sample i, the adjoint λ and its information Λ collect what the readings
-    from this sample on say about its state. With C = I - K H and the whitener W of the filter (eqs.
-    (5) and (6) of the module docstring),
+    Backward from the last sample, the adjoint λ_i and its information Λ_i collect what the readings
+    from sample i on say about the state at this sample; both are zero after the last sample. With C
+    = I - K H and the whitener W of the filter (eqs. (5) and (6) of the module docstring), the
+    smoothed state δ and the missing force f are
 
         λ_i = Cᵀ Aᵀ λ_{i+1} - Hᵀ Wᵀ W e,    Λ_i = Cᵀ Aᵀ Λ_{i+1} A C + Hᵀ Wᵀ W H
         δ_i = δ- - P- λ_i,    f_{i-1} = - Q Gᵀ λ_i
@@ -650,6 +659,7 @@ def run_smoother(
         closed: (Z, Z) C.
         weighed: (C, Z) W H.
     """
+    # Indices: z and y of states, c and d of channels, e of forces, i of samples.
     runs, samples, channels, size = readings.shape
     count = forces.shape[3]
     for run in range(runs):
@@ -661,7 +671,8 @@ def run_smoother(
             h, whitener = readings[run, i], whiteners[run, i]
             multiply_sparse(whitener, h, weighed)
             if i + 1 < samples:
-                # Carry λ and Λ from the next sample to this one; closed = I - K H.
+                # Carry λ and Λ from the next sample to this one: λ becomes backᵀ λ, and Λ becomes
+                # backᵀ Λ back, with back = A closed and closed = I - K H.
                 for z in range(size):
                     for y in range(size):
                         closed[z, y] = 1.0 if z == y else 0.0
@@ -705,20 +716,22 @@ def run_smoother(
                     smoothed[run, i, z] -= covariances[run, i, y, z] * adjoint[y]  # (6)
             if i == 0:
                 break
-            # Missing force between the previous sample and this one, and what it adds to (7).
+            # Missing force between the previous sample and this one, and what it adds to (7):
+            # `force_adjoint` is the element e of Gᵀ λ, `force_information` that of the diagonal of
+            # Gᵀ Λ G.
             g = forces[run, i - 1]
             for e in range(count):
-                pushed, known = 0.0, 0.0
+                force_adjoint, force_information = 0.0, 0.0
                 for z in range(size):
                     if g[z, e] != 0.0:
-                        pushed += g[z, e] * adjoint[z]
+                        force_adjoint += g[z, e] * adjoint[z]
                         for y in range(size):
                             if g[y, e] != 0.0:
-                                known += g[z, e] * information[z, y] * g[y, e]
-                q = deviations[run, e]
-                missing[run, i - 1, e] = -q * q * pushed
-                measured[e] += pushed * pushed
-                expected[e] += known
+                                force_information += g[z, e] * information[z, y] * g[y, e]
+                deviation = deviations[run, e]
+                missing[run, i - 1, e] = -deviation * deviation * force_adjoint
+                measured[e] += force_adjoint * force_adjoint
+                expected[e] += force_information
 
 
 def multiply_sparse(a: Array, b: Array, out: Array) -> None:
@@ -734,7 +747,7 @@ def multiply_sparse(a: Array, b: Array, out: Array) -> None:
 
 
 def multiply_transposed(a: Array, b: Array, out: Array) -> None:
-    """Write aᵀ b to `out`; zeros of a are skipped."""
+    """Write aᵀ b to `out`; zeros of a are skipped, because most entries of a are zero."""
     for i in range(a.shape[1]):
         for j in range(b.shape[1]):
             out[i, j] = 0.0

@@ -166,12 +166,14 @@ def track_joints(times: Array, readings: list[JointReadings]) -> list[Array]:
     ).subset(np.repeat(joint_indices, jerk_count))
     # Standard deviation of the jerk of each of these runs.
     jerks = (position_ranges[:, None] * JERKS / span**3).reshape(-1, 1)
+    # Both channels have noise of variance one, because readings are in units of the noise.
     filtered = filter_runs(runs, jerks, np.ones(2))
     log_likelihoods = filtered.log_likelihood.reshape(count, jerk_count)
     # Indices of the runs with the likeliest jerk of each joint.
     likeliest = np.argmax(log_likelihoods, axis=1) + jerk_count * joint_indices
     best_runs = runs.subset(likeliest)
     smoothed = smooth_runs(best_runs, filtered.subset(likeliest), jerks[likeliest])
+    # Back from deviations to positions.
     states = smoothed.states
     states[:, :, 0] += first_positions[:, None]
     return list(states)

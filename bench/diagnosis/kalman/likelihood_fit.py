@@ -127,7 +127,7 @@ def compute_likelihood_step(
     derivatives = _compute_derivatives(followed, bounds)
     information = derivatives.T @ derivatives
     cross = derivatives.T @ followed.filtered.whitened.reshape(-1)
-    # Lengths of the columns of J.
+    # Lengths of the columns of J; a column of zeros must not be divided by zero.
     scale = np.maximum(np.sqrt(np.diagonal(information)), 1e-300)
     normal = information / scale / scale[:, None] + RIDGE * np.eye(len(indices))
     values = followed.theta[indices]
@@ -197,7 +197,7 @@ def _compute_derivatives(followed: FollowedRuns, bounds: Mapping[int, Bounds]) -
     differences = np.array(
         [_compute_difference(followed, index, limits) for index, limits in bounds.items()]
     )
-    # Parameters whose bounds differ.
+    # Columns of the parameters whose bounds differ; those with equal bounds stay zero.
     columns = np.flatnonzero(differences)
     parameters = np.array(list(bounds), dtype=np.intp)[columns]
     responses = compute_parameter_responses(followed, parameters.tolist(), differences[columns])

@@ -133,7 +133,8 @@ class FollowedRuns:
 
         Returns:
             The filter with the highest log-likelihood. The first one, about the motion of the
-            readings, counts only if it is the only one, or if motions are simulated.
+            readings, counts only if it is the only one, or for a robot on the ground, whose motions
+            are simulated.
         """
         assert isinstance(evaluator.simulator, RobotSimulator)
         robot = evaluator.simulator.robot
@@ -169,11 +170,12 @@ class FollowedRuns:
             force, noise = followed.force, followed.noise
             gain = np.inf if best is None else followed.log_likelihood - best.log_likelihood
             # The first motion is that of the readings alone, which the robot may not be able to
-            # make. So the second filter replaces the first one in any case, unless motions are
-            # simulated.
+            # make. So the second filter replaces the first one in any case, unless the motion is
+            # simulated, as for a robot on the ground.
             is_second_about_possible_motion = iteration == 1 and not robot.is_on_ground
             best = followed if gain > 0.0 or is_second_about_possible_motion else best
-            # For the next iteration.
+            # Motions or, for a robot on the ground, first states about which the next iteration is
+            # linear.
             motions, first_states = followed._get_smoothed_motions()
             if not gain > LINEARISED_GAIN:
                 break
@@ -193,7 +195,7 @@ class FollowedRuns:
             The likeliest filter; this one if none is clearly likelier.
         """
         best, negligible_force = self, FIRST_FORCE * self.typical
-        # Its motions are simulated, and their Jacobians are not reused.
+        # For a robot on the ground, `follow` computes all Jacobians about simulated motions.
         if self.is_on_ground:
             return self
         for _ in range(MAX_LINEARISATIONS):
@@ -221,7 +223,8 @@ class FollowedRuns:
     ) -> FollowedRuns:
         """Return the filter of a model with other parameters.
 
-        The model is linearised once about the smoothed motion of this filter, and its process noise
+        The model is linearised once about the smoothed motion of this filter (for a robot on the
+        ground, about a motion simulated from its smoothed first state), and its process noise
         starts from the present one. Derivatives (Jacobians) take most of the time, so they are
         reused where they hardly differ.
 
@@ -293,6 +296,8 @@ class FollowedRuns:
         # Indices of the parameters that differ and may change the Jacobians.
         changed = set(np.flatnonzero(theta != self.theta).tolist())
         for name in evaluator.coefficient_slices:
+            # An effect at all places is a family, with one member at each place. `of` is the name
+            # of a member without its place.
             members = members_of(evaluator.available_effects[name])
             if all(m.hook == "sensor" or m.of in TIME_DEPENDENT_EFFECTS for m in members):
                 changed -= set(evaluator.get_coefficient_indices(name))
@@ -309,6 +314,9 @@ class FollowedRuns:
         typical: Array,
     ) -> FollowedRuns:
         """Fit the process noise of the linearised models of all runs, and return their filter.
+
+        Process noise is a random force at each coordinate, which stands for forces that the model
+        lacks. The correlation of the sensor noise is fitted with it.
 
         Args:
             evaluator: the R runs to follow.
@@ -366,6 +374,9 @@ class FollowedRuns:
         """Return the filter of changed linear models with refitted noise.
 
         Process noise and the correlation of the sensor noise are fitted again.
+
+        Args:
+            runs: the changed linear models of all runs, without states for coloured noise.
         """
         return replace(
             self, runs=runs, **_fit_noise(runs, self.noise, self.force, self.typical)._asdict()
@@ -389,7 +400,7 @@ class FollowedRuns:
         losses = []
         for coordinate in range(self.force.size):
             force = self.force.copy()
-            # A share of the typical force at this coordinate.
+            # Negligible: a tiny share of the typical force at this coordinate.
             force[coordinate] = SMALLEST_FORCE * self.typical[coordinate]
             filtered = filter_runs(coloured, force, white)
             losses.append(2.0 * (log_likelihood - float(filtered.log_likelihood.sum())))
@@ -450,8 +461,9 @@ class FollowedRuns:
         corrects, so the gain of the filter is left out.
         """
         joints = len(self.linear[0].trajectory.x[0])
-        # The state of the linear model may have joints in series after those of the robot.
-        # Indices of the positions and the velocities; `positions` is the number of positions.
+        # Indices of the positions and the velocities of the robot's joints in the state of the
+        # linear model. It may have joints in series after them, so that velocities begin only at
+        # `positions`, the number of all positions.
         joint_states = np.concatenate(
             [np.arange(joints), self.linear[0].positions + np.arange(joints)]
         )
@@ -575,6 +587,8 @@ class FollowedRuns:
           velocity from a linear model. A joint that rests may stick: its position is the mean of
           the readings at rest, its velocity zero.
         - Other joint: smoothed states.
+
+        States are SI units: all positions first, then all velocities.
         """
         if self.is_on_ground:
             return self._settled_first_states
@@ -677,14 +691,17 @@ def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array
     """Fit the process noise and the correlation of the sensor noise by maximum likelihood.
 
     The process noise, which stands for missing forces, is fitted with the given correlation first.
-    Larger correlations φ of AR(1) noise follow, in ascending order, each with the process noise
-    fitted again, as long as the log-likelihood increases.
+    Larger correlations φ of AR(1) noise follow, in ascending order and equal in all channels, each
+    with the process noise fitted again, as long as the log-likelihood increases.
 
     Args:
         runs: the linear models.
         noise: sensor noise of each channel.
         force: (E,) initial standard deviations of the missing forces.
         typical: (E,) typical forces in N or N·m, scales of the missing ones.
+
+    Returns:
+        The likeliest noise, with the results of filter and smoother.
     """
     best: _NoiseFit | None = None
     given_phi = float(noise.phi.max(initial=0.0))
@@ -740,7 +757,7 @@ def linearise_run(
             matrices are reused; None to compute all matrices.
         simulator: robot with other contact or friction settings; None for that of the evaluator.
         reuses_jacobians: whether derivatives of steps are taken from the neighbour.
-        reuses_loads: whether the forces that transmissions carry are taken from the neighbour.
+        reuses_loads: whether the forces that transmissions carry are taken from the neighbour, too.
         first_state: first state from which a robot on the ground is simulated; None for that of
             the readings.
     """
@@ -748,7 +765,7 @@ def linearise_run(
     half = len(evaluator.state_names) // 2
     scenario = evaluator.prepared_runs[run].scenario
     guess = evaluator.initial_state_guesses[run]
-    # Positions and velocities from which unmeasured joints are simulated.
+    # Positions and velocities from which joints without readings are simulated.
     start = guess[:half], guess[half:]
     robot = simulator or evaluator.simulator
     assert isinstance(robot, RobotSimulator)

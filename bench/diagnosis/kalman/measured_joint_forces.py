@@ -75,8 +75,9 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
         run: the recorded run.
 
     Returns:
-        Forces that the motion requires, that the drives exert, and that would hold the robot still.
-        A drive that is recorded as off exerts no force.
+        Forces (T, D) that the motion requires, that the drives exert, and that would hold the robot
+        still, and the velocities, at T samples and D joints. A drive that is recorded as off exerts
+        no force.
     """
     model = robot.compiled
     # Position, velocity and acceleration (T, 3) of each of the D joints, (D, T, 3) together.
@@ -100,7 +101,8 @@ def compute_joint_forces(robot: RobotModel, recording: Recording, run: Run) -> J
         joint_name = robot.actuator(name).joint
         # An actuator may act on something else than one joint.
         if joint_name is not None:
-            # Then the hypotheses "on" and "off" have the same residual there.
+            # Without a driving force, the hypotheses that the drive is on or off, which
+            # `JointForces.residuals` compares, have the same residual there.
             driven[off_mask, names.index(joint_name)] = 0.0
     return JointForces(needed - applied, driven, holding - applied, motion[1])
 

@@ -72,7 +72,8 @@ class FirstStateFactors(NamedTuple):
 def get_state_noise(evaluator: RunEvaluator, noise: NoiseModel) -> tuple[Array, Array]:
     """Return the noise (D,) of positions, and that of velocities computed from their differences.
 
-    Both are standard deviations, those of velocities per second.
+    Both are standard deviations: of D positions in rad or m, and of their differences per sample
+    interval, in rad/s or m/s.
 
     Args:
         evaluator: the runs of a robot on the ground, whose joints are recorded.
@@ -187,8 +188,8 @@ class FirstStateFitter:
             # One row for each run.
             residuals = self.simulate_residuals(theta, states).reshape(len(states), -1)
             # The Gauss-Newton step solves R step = Q' residual with the QR factors of the
-            # derivatives. Q has further rows for the prior, whose residual is zero at the present
-            # states.
+            # derivatives. Q has further rows for the prior, which is about the present states of
+            # each step, so that its residual is zero and its rows are left out.
             steps = np.array(
                 [
                     np.linalg.solve(r, q[: residual.size].T @ residual)

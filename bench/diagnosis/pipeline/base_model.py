@@ -86,6 +86,9 @@ class BaseModel:
 
         They change the best parameters only a little, so the fit starts from those of this fit,
         unless it failed or parameters were identified by prediction errors.
+
+        Args:
+            runs: the same runs, whose simulator has another time step or other solver options.
         """
         can_start_from_fit = np.isfinite(self.fit.fit.cost) and runs.context.identified is None
         initial_base = (
@@ -119,19 +122,23 @@ class BaseModel:
         return replace(self, fit=fit)
 
     def correct_step_errors(self) -> BaseModel:
-        """Return the base model without the discretisation error of the engine's steps.
+        """Correct the discretisation error of the engine's steps, and refit the base model.
 
-        Effects would otherwise explain this error. It is corrected if the recording shows it, or if
-        no filter could decide, unless it is too large. If a force is missing, such as that of a
-        mass, it may imitate this error, so that the search decides later, with the force in the
-        model.
+        Effects would otherwise explain this error. The model is returned as it is in three cases:
+
+        * A Kalman filter of the runs found that a force is missing. The missing force may look like
+          this error, so that the search decides later, with the force in the model.
+        * The filter found no error of the steps.
+        * The error is too large for a correction.
+
+        Without a filter of the runs, the error is corrected in any case, unless it is too large.
         """
         # These imports are needed for robots only.
         from bench.diagnosis.evaluation.discretisation_error import correct_discretisation
         from bench.diagnosis.prediction_error.regression_selection import shows_step_errors
 
         evaluator = self.runs.fitting
-        # The runs, followed by a Kalman filter; None if no filter could decide.
+        # The filtered runs; None if no filter is valid for them.
         followed = evaluator.filtered_runs
         if followed is not None and (followed.has_missing_force or not shows_step_errors(followed)):
             return self
@@ -164,7 +171,7 @@ class BaseModel:
         if residual_rms < MIN_REFITTED_RESIDUAL:
             return self
         start = find_first_states(runs.fitting, runs.noise, self.fit.fit)
-        # No better first states were found.
+        # The search found no better first states.
         if start is None:
             return self
         return replace(self, fit=self.fit.refit(runs.fitting, runs.noise, start))
@@ -181,7 +188,11 @@ def filter_and_fit(runs: SimulatedRuns) -> BaseModel:
 def _get_starts(runs: SimulatedRuns) -> Array | None:
     """Return starting values of the base parameters; None for the default starts.
 
-    They come from a registered tuner, or are those identified by prediction errors.
+    They come from a registered tuner if the user names one; otherwise they are those identified by
+    prediction errors, if there are any.
+
+    Args:
+        runs: the runs, with the options of the user and the identified parameters in their context.
     """
     options = runs.context.options
     if options.tuner is None:

@@ -75,6 +75,8 @@ class CauseSearch:
         # 2. Soft friction.
         except SoftFrictionError as error:
             soft_result = self._search_with_soft_friction(base, search, error.start)
+            # Its result counts, except one of a preliminary choice that explains nothing: then
+            # stiff friction is tried again, if there is time left.
             if (
                 not error.is_preliminary
                 or soft_result.is_explained
@@ -102,11 +104,13 @@ class CauseSearch:
         """
         runs = base.runs
         result = self._find_causes(base, search, rng)
-        # The search itself compares the forms of friction that it selects, unless stiff friction
-        # nearly explains the runs. It does not compare those of friction that is a free number of
-        # the model file, which is in the base model.
+        # The two forms still have to be compared for
+        # 1. dry friction that is a free number of the model file: it is part of the base model, and
+        #    the search compares the forms of friction effects only;
         has_free_friction = has_dry_friction(runs.fitting, ())
-        # A model that stays incomplete leaves far more than the difference of the two forms.
+        # 2. effects with dry friction, if stiff friction nearly explains the runs: the search then
+        #    compares nothing. This is needless if they are fully explained, or if the model stays
+        #    incomplete, as its residual is far larger than the difference of the two forms.
         is_settled = result.is_explained or result.finding.is_incomplete
         compared_effects = () if is_settled else result.finding.model.effects
         is_comparison_needed = (
@@ -125,9 +129,10 @@ class CauseSearch:
         if soft_model is None:
             return result
         soft_result = self._search_with_soft_friction(base, search, soft_model.fit.make_start())
+        # Friction of the model file is in every model, so that its likelier form is accepted. Soft
+        # friction of an effect may only imitate what the model lacks, unless it explains the runs.
         if has_free_friction or soft_result.is_explained:
             return soft_result
-        # Soft friction of an effect may only imitate what the model lacks.
         runs.context.say(STIFF_FRICTION)
         return result
 
@@ -164,6 +169,8 @@ class CauseSearch:
             return self._find_causes(base, stiff_search, rng)
         except SoftFrictionError as error:
             start = error.start
+            # A further search would only repeat the one with soft friction if that has fitted its
+            # first model already: the base model (no start), or the model of the start.
             if start is None or frozenset(start.effects) in soft_result.search.models:
                 runs.context.say(SOFT_FRICTION)
                 return soft_result
@@ -178,6 +185,9 @@ class CauseSearch:
             base: base model, fitted with stiff friction.
             stiff_search: search with stiff friction; its filters are reused where they are valid.
             likely: model that may explain the runs, which is fitted first; None without one.
+
+        Returns:
+            The result of the new search, whose runs have soft friction.
         """
         stiff_runs, context = base.runs, base.runs.context
         context.say(SOFT_FRICTION)
@@ -199,10 +209,10 @@ class CauseSearch:
     def _find_causes(
         self, base: BaseModel, search: EffectSearch, rng: np.random.Generator
     ) -> SearchResult:
-        """Return the finding; without causes if the recording has a wrong unit or sign.
+        """Search for causes; return a result without causes if a unit or sign is wrong.
 
-        Every cause would only imitate the wrong unit or sign. Some are known before the search,
-        others show in its result.
+        Every cause would only imitate the wrong unit or sign of the recording. Some of these errors
+        are known before the search, others show in its result.
 
         Args:
             base: the fitted base model.
@@ -218,7 +228,8 @@ class CauseSearch:
             check.check_result(result)
             if not check.errors:
                 return result
-        # 2. A result without causes, with the errors.
+        # 2. A result without causes, with the errors. The base model takes the place of the found
+        # one.
         model = search.base_model
         finding = DiagnosisResult("unknown", model, model, (), assess_lack_of_fit(search, model))
         return SearchResult(base, search, finding, rng, check.errors)
@@ -261,7 +272,7 @@ def _take_over(
     Args:
         search: search that has not begun.
         other: search with another form of dry friction.
-        likely: model that may explain the runs.
+        likely: model that may explain the runs, which the search fits first; None without one.
         is_reusable: whether the base model has no dry friction, so that the filters are valid.
     """
     # This import is needed for robots only.

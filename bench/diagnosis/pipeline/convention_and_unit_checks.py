@@ -54,6 +54,7 @@ class RecordingErrorCheck:
             The wrong units and signs; empty if all are right or if nothing was tested.
         """
         is_over = result.runs.context.search_control.is_over()
+        # For the other recordings, units and signs were tested before the search.
         if not _is_checked_late(result.runs) or result.is_explained or is_over:
             return ()
         search, finding = result.search, result.finding
@@ -122,7 +123,11 @@ def _is_checked_late(runs: SimulatedRuns) -> bool:
     This is the order for robots. If the runs of a robot could be filtered, but its free numbers
     could not be identified from the prediction errors, units are checked before the search, as for
     other systems.
+
+    Args:
+        runs: the runs, before or after the search.
     """
+    # The robot has free numbers, and a filter, but no numbers that were identified.
     has_unidentified_base = (
         bool(runs.fitting.base_indices.size)
         and runs.context.identified is None

@@ -10,14 +10,15 @@ from sims.extended_simulator import ExtendedSimulator
 def build_extended_simulator(result: SearchResult) -> ExtendedSimulator:
     """Build the extended simulator from the model of the found effects.
 
-    It is the simulator of the recording with fitted parameters, freed constants and added effects,
-    as written to ``extended.toml``.
+    It is the simulator of the recording with fitted parameters, fitted values of the constants that
+    the user freed (made parameters of the fit), and added effects, as written to ``extended.toml``.
 
     Args:
         result: result of the search.
     """
     runs, model = result.runs, result.finding.model
     evaluator, recording = runs.fitting, runs.recording
+    # Estimates by index in the parameter vector: base parameters, freed constants, coefficients.
     estimates = result.estimates.values
     base_values = {
         p.name: estimates[i]

@@ -53,10 +53,11 @@ class HeldOutGainCalculator:
 
     @cached_property
     def noise_sigma(self) -> Array:
-        """Noise (C,) of each channel: specified by the recording, or else estimated.
+        """Return the noise (C,) of each of C channels: stated by the recording, or else estimated.
 
-        The estimate assumes white noise, and autocorrelated noise exceeds it. So it is replaced by
-        the residual of the found model, if that is larger and has no structure.
+        It is a standard deviation in the unit of the channel. The estimate assumes white noise, and
+        autocorrelated noise exceeds it. So it is replaced by the residual of the found model, if
+        that is larger and has no structure.
         """
         finding, floor = self.result.finding, self.result.runs.floor
         residual_sigma = finding.model.likelihood.sigma
@@ -66,17 +67,19 @@ class HeldOutGainCalculator:
 
     @cached_property
     def _channels(self) -> list[int]:
-        """Indices of the channels that count: those of one unit, since units cannot be added.
+        """Return the indices of the channels that count: those of one unit.
 
-        The unit is that of the channel on which sensor effects act. If the base model predicts
-        these channels to within the noise, it is the unit of the largest error instead: the pose of
-        a robot's base may not show what the encoder of a wheel shows.
+        Errors in different units cannot be added. The unit is that of the channel on which sensor
+        effects act (the usual unit). If the base model predicts the channels with this unit to
+        within the noise, it is the unit of motion with the largest error in units of the noise: the
+        pose of a robot's base may not show what the encoder of a wheel shows.
         """
         evaluator = self.result.runs.fitting
         units = [channel.unit for channel in evaluator.simulator.channels]
-        reading = evaluator.simulator.system.reading(evaluator.channels)
-        usual_unit = units[evaluator.channels.index(reading)]
-        indices = {
+        # Name of the channel on which sensor effects act.
+        sensor_channel = evaluator.simulator.system.reading(evaluator.channels)
+        usual_unit = units[evaluator.channels.index(sensor_channel)]
+        indices_by_unit = {
             unit: [c for c, channel_unit in enumerate(units) if channel_unit == unit]
             for unit in units
             if unit in (usual_unit, *MOTION_UNITS)
@@ -84,18 +87,18 @@ class HeldOutGainCalculator:
         # Predictions by the effects of their model; the base model has none, and the key ().
         runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits or {}
         if runs is None or () not in held_out_fits:
-            return indices[usual_unit]
+            return indices_by_unit[usual_unit]
         before = held_out_fits[()].simulated
         # RMS error of the base model over the channels of each unit, relative to their noise.
         ratios = {
             unit: _compute_rmse(runs, before, channels) / compute_rms(self.noise_sigma[channels])
-            for unit, channels in indices.items()
+            for unit, channels in indices_by_unit.items()
         }
         unit_of_largest = max(ratios, key=lambda unit: ratios[unit])
         is_visible_elsewhere = (
             ratios[usual_unit] < MAX_NOISE_LIKE_ERROR_RATIO < ratios[unit_of_largest]
         )
-        return indices[unit_of_largest if is_visible_elsewhere else usual_unit]
+        return indices_by_unit[unit_of_largest if is_visible_elsewhere else usual_unit]
 
     @property
     def _noise_floor(self) -> float:
@@ -106,8 +109,8 @@ class HeldOutGainCalculator:
         """Measure by how much the causes improve the prediction of held-out runs.
 
         The error of a prediction falls from that of the base model towards the noise floor. If
-        another time step or solver option was chosen, the base model is that of the model file's
-        own.
+        another time step or solver option was chosen, the error before is that of the base model
+        with the settings of the model file.
 
         Returns:
             Errors and the share of the gap that is closed, with its interval; None if the
@@ -128,7 +131,7 @@ class HeldOutGainCalculator:
         gain = self._compute_gain(runs, before, after, self.result.rng)
         # All channels that count have the unit of the first one.
         channel = self.result.runs.fitting.simulator.channels[self._channels[0]]
-        # An interval that the data do not give is None.
+        # Fields of the gain in their order; an interval that the data do not give is None.
         base, extended, floor, share, low, high = map(to_finite_or_none, astuple(gain))
         return HeldOutResult(base, extended, floor, share, low, high, channel.unit)
 
@@ -145,7 +148,7 @@ class HeldOutGainCalculator:
             after: (R, T, C) the other prediction.
             rng: source of the bootstrap samples.
         """
-        # Cross-validated runs are few, and gains are resampled by segments.
+        # Cross-validated runs are too few to resample, so segments of them are resampled.
         by_segments = self.result.runs.is_cross_validated
         return compute_held_out_gain(
             runs, before, after, self._channels, self._noise_floor, rng, by_segments
@@ -181,6 +184,7 @@ class HeldOutGainCalculator:
         runs, held_out_fits = self.result.runs.predicted, self.result.finding.held_out_fits
         if runs is None or held_out_fits is None:
             return {}
+        # The base model has no effects, and the key ().
         before = held_out_fits[()].simulated
         intervals = {}
         for names, held_out_fit in held_out_fits.items():
@@ -259,7 +263,10 @@ def compute_held_out_gain(
     rng: np.random.Generator,
     resamples_segments: bool = False,
 ) -> HeldOutGain:
-    """Compute the share of the gap closed (1), with a 95 % bootstrap interval over runs.
+    """Compute the share of the gap closed, with a 95 % bootstrap interval over runs.
+
+    With the RMS errors b of the base model and a of the extended model, and the noise floor n, the
+    share is (b - max(a, n)) / (b - n) (1).
 
     Whole runs are drawn with replacement, because samples of one run depend on each other. With a
     single run, or on request, segments of the runs are drawn instead (D. N. Politis, J. P. Romano
@@ -276,6 +283,9 @@ def compute_held_out_gain(
         rng: Random generator of the resampling.
         resamples_segments: Whether the bootstrap draws segments of the runs instead of whole runs;
             two or three runs are too few to draw from.
+
+    Returns:
+        Both errors, the share, and the ends of its interval, which are NaN without an interval.
     """
     # Each row is a part, a run or a segment, with the squared errors of both models and the number
     # of samples.
@@ -362,13 +372,13 @@ def _compute_rms_errors(sums: Array) -> tuple[Array, Array]:
 
 
 def compute_closed_share(base: Array | float, extended: Array | float, floor: float) -> Array:
-    """Compute the share of the gap closed (1) of any number of models; 0 without a gap.
+    """Compute the share of the gap closed of any number of models; 0 without a gap.
 
-    The lower limit is `MIN_REPORTED_GAIN`.
+    It is (base - max(extended, floor)) / (base - floor) (1), between `MIN_REPORTED_GAIN` and 1.
 
     Args:
-        base: RMS errors before.
-        extended: RMS errors after.
+        base: RMS errors of base models.
+        extended: RMS errors of extended models, of the same shape.
         floor: RMS of the noise.
     """
     gap = base - floor

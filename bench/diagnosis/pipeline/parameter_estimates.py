@@ -59,6 +59,7 @@ class ParameterEstimates:
                 half_interval = evaluator.sample_interval / 2
                 low, high = low - half_interval, high + half_interval
             is_fitted = index in intervals
+            # Which bound of its range a value is at: "low", "high" or None.
             at_bound = bound_of(value, *ranges[index]) if is_fitted else None
             # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
             has_interval = np.isfinite(low) and np.isfinite(high) and at_bound is None
@@ -80,8 +81,11 @@ class ParameterEstimates:
     def _get_plausible_range(self, index: int) -> tuple[float, float]:
         """Return the plausible range of a parameter, by its index in the parameter vector.
 
-        A robot's free number, a number of its model file that is fitted, may have wide bounds; its
-        range for training is then the plausible one.
+        A robot's free number, a number of its model file that is fitted, may have wide bounds. If
+        it has a range for training (`training`), that is the plausible one.
+
+        Args:
+            index: index in the parameter vector.
         """
         evaluator = self.search.evaluator
         parameter = evaluator.parameters[index]

@@ -201,6 +201,12 @@ def _check_sample_count(runs: SimulatedRuns) -> None:
     """Refuse a recording with too few samples for its parameters and initial states.
 
     With fewer samples than unknowns every model fits exactly, and no gap would be visible.
+
+    Args:
+        runs: the prepared runs.
+
+    Raises:
+        InputError: There are too few samples.
     """
     evaluator = runs.fitting
     samples = int(np.isfinite(evaluator.observed).sum())
@@ -219,6 +225,12 @@ def _check_sizes(runs: SimulatedRuns) -> None:
 
     Their unit must be wrong. They are compared with the typical size of the channel,
     `channel.scale`.
+
+    Args:
+        runs: the prepared runs, for fitting and held out.
+
+    Raises:
+        InputError: A value is too large.
     """
     for c, channel in enumerate(runs.fitting.simulator.channels):
         largest = max(

@@ -57,7 +57,8 @@ def build_report_data(
         notes: Further notes, one sentence each.
     """
     evaluator, recording, finding = result.runs.fitting, result.runs.recording, result.finding
-    # Before and after: the fitted base model, and the model with the causes.
+    # Simulated runs (R, T, C) before and after: of the fitted base model, and of the model with the
+    # causes.
     before, after = finding.base.fit.simulated, finding.model.fit.simulated
     # The noise is that of the finding, because a good model estimates it better.
     gains = HeldOutGainCalculator(result)
@@ -81,7 +82,7 @@ def build_report_data(
         reasons = tuple(list_verdict_reasons(finding))
         consistency = _assess_consistency(result)
     return DiagnosisReportData(
-        # A recording without a title is identified by its file name.
+        # A recording without a title gets the name of its file.
         title=recording.title or recording.path.stem,
         path=recording.path,
         verdict=verdict,
@@ -188,13 +189,14 @@ def _list_parameter_changes(result: SearchResult) -> Iterator[ParameterChange]:
     after = result.estimates.values
     for i in evaluator.base_indices.tolist():
         parameter = evaluator.parameters[i]
-        is_free = i not in result.base.fit.fixed_parameters
+        # Fixed parameters stay at their nominal values, as the data do not determine them.
+        is_sensitive = i not in result.base.fit.fixed_parameters
         yield ParameterChange(
             name=parameter.name,
             unit=parameter.unit,
             before=_get_value_and_interval(before[i]),
             after=_get_value_and_interval(after[i]),
-            is_sensitive=is_free,
+            is_sensitive=is_sensitive,
             bounds=(before[i].at_bound, after[i].at_bound),
             in_file=format_file_change(after[i]),
         )
@@ -211,6 +213,13 @@ def _assess_consistency(result: SearchResult) -> ConsistencySummary:
     """Assess the consistency of runs, logs and loads for the base and the extended model.
 
     Consistency means that groups of runs give the same parameters as all runs together.
+
+    Args:
+        result: result of the search.
+
+    Returns:
+        Consistency of each parameter before and after the causes are added, and that of the best
+        competing effect; empty if the search ended early or the base model is not identified.
     """
     search, finding = result.search, result.finding
     # Without a complete search or an identified base model, there is nothing to compare.
@@ -265,6 +274,9 @@ def _read_track_figure(recording: Recording) -> bytes:
 
     A recording is from a film if it has the columns of the tracked ball. A file that is too large
     or not a PNG is left out, because any file may have that name.
+
+    Args:
+        recording: the recording, with its path and its extra columns.
     """
     path = recording.path.with_suffix(".png")
     if not recording.extra.keys() >= TRACK_COLUMNS:

@@ -53,7 +53,7 @@ def filter_simulated_runs(runs: SimulatedRuns) -> None:
     runs.fitting.follow(filtered_runs)
     if context.search_control.is_over():
         return
-    # 3. Held-out runs.
+    # 3. Held-out runs. The first run evaluator is that of the runs for fitting.
     for evaluator in runs.evaluators[1:]:
         # Held-out runs are only simulated; without a filter they begin at their measured values.
         theta = evaluator.get_nominal_theta()

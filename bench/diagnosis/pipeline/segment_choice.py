@@ -75,6 +75,9 @@ def find_segment_duration(model: BaseModel) -> float | None:
     Args:
         model: Base model, fitted to whole runs.
 
+    The amplification is the largest change of a reading in a segment, in units of its noise, that
+    follows from an error of one first position by the noise of its readings.
+
     Returns:
         The longest of `SEGMENT_DURATIONS` with a small amplification, or the shortest if none
         has one. None if whole runs can be used: the base model simulates them well, they
@@ -85,6 +88,7 @@ def find_segment_duration(model: BaseModel) -> float | None:
         return None
     _, residual_rms = model.rate()
     is_simulated = residual_rms < MIN_UNFOLLOWED_RESIDUAL
+    # Negated, so that NaN counts as a small amplification.
     if is_simulated or not followed.compute_amplification() > MAX_RUN_AMPLIFICATION:
         return None
     for seconds in SEGMENT_DURATIONS:

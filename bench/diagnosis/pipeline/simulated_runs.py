@@ -75,9 +75,13 @@ class DiagnosisContext:
             self.notes.append(note)
 
     def adopt(self, evaluator: RunEvaluator) -> None:
-        """Prepare a new run evaluator with what all steps of the diagnosis share.
+        """Give a new run evaluator what all steps of the diagnosis share.
 
-        These are time limit, workers, widened ranges of base parameters, and identified parameters.
+        These are the time limit, the workers, the widened ranges of base parameters, and the
+        parameters that were identified by prediction errors.
+
+        Args:
+            evaluator: run evaluator, which is changed.
         """
         evaluator.search_control = self.search_control
         evaluator.worker_pool = self.worker_pool
@@ -196,7 +200,10 @@ class SimulatedRuns:
     def with_kind(self, kind: type[SystemSimulator]) -> SimulatedRuns:
         """Return the runs with another class of simulator of the same system.
 
-        State filters of the runs are taken over.
+        The filters of the runs, which estimate their states, are taken over.
+
+        Args:
+            kind: simulator class, for example with another time step.
         """
         runs = SimulatedRuns.build(self.context, kind, self.recording)
         for known, evaluator in zip(self.evaluators, runs.evaluators, strict=True):

@@ -113,8 +113,9 @@ class RatedOptions(NamedTuple):
     def is_better_than(self, other: RatedOptions) -> bool:
         """Return whether these options explain the recording better than others, on their own.
 
-        They must close half of the gap, and predict the held-out runs better. If the same options
-        are changed, only to other values, a clearly higher likelihood is enough.
+        They must close half of the gap, which is the residual beyond the noise, and predict the
+        held-out runs at least as well. If the same options are changed, only to other values, a
+        clearly higher likelihood is enough.
 
         Args:
             other: base model with other options, to compare with.
@@ -188,7 +189,8 @@ class SolverOptionChoice:
         options = self._possible_options
         if options is None or result.has_ended:
             return result
-        # Ratings are the penalised log-likelihood and the excess residual.
+        # A rating is the penalised log-likelihood and the excess of the RMS residual, in units of
+        # the noise, over the 1 of noise alone.
         rating = result.rate()
         option_rating = options.penalised_log_likelihood, options.residual - 1.0
         if not is_clearly_better(rating, option_rating) and result.is_explained:
@@ -197,6 +199,7 @@ class SolverOptionChoice:
         other = cause_search.search(model.finish())
         if is_clearly_better(rating, other.rate()):
             return other
+        # `_use` has stored the other options as a finding, but they are not used after all.
         self.finding = None
         return result
 
@@ -244,7 +247,7 @@ def _improve_options(rated: RatedOptions) -> RatedOptions:
                 filter_simulated_runs(runs)
             tried.append(RatedOptions.rate(rated.model.refit(runs)))
         best = max(tried, key=lambda one: one.log_likelihood, default=rated)
-        # Nothing was tried, or nothing is better.
+        # Nothing was tried, or nothing is better: further options are not changed.
         if best is rated or not best.is_better_than(rated):
             break
         rated = best
@@ -334,8 +337,8 @@ def rank_option_alternatives(
 def _iterate_alternatives(kind: type[RobotSimulator]) -> Iterator[IntegratorSettings]:
     """Yield solver settings that differ from the present ones in one option.
 
-    The solver and its number of iterations count as one option; many iterations, which are more
-    common, come first.
+    The solver and its number of iterations count as one option, so both may change at once; many
+    iterations, which are more common, come first.
 
     Args:
         kind: simulator class of the robot.
@@ -400,7 +403,8 @@ def _has_competing_effect(options: RatedOptions, file_options: RatedOptions) -> 
     # 3. Gains.
     squares = np.square(search.compute_residual(model.fit) / runs.noise.sigma).sum()
     sample_count = float(search.observed_mask.sum())
-    # Twice the log-likelihood of white noise is -n log(sum of squares), up to a constant.
+    # With the size of the noise estimated, twice the log-likelihood of n samples of white noise is
+    # -n log(sum of squares), up to a constant.
     scan_gain = sample_count * float(np.log(squares / lowest_squares))
     option_gain = options.log_likelihood - file_options.log_likelihood
     return max(scan_gain, score) > MIN_COMPETING_GAIN_SHARE * option_gain

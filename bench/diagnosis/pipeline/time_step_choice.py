@@ -86,6 +86,7 @@ class TimeStepChoice:
         # it is needed; copies of a tee share those that were simulated, also with `reconsider`.
         (refinements,) = tee(find_step_refinements(runs.fitting, runs.noise), 1)
         first = next(copy(refinements), None)
+        # Innovations that show the error prove that it matters, however small it is.
         min_error = 0.0 if shows_errors else MIN_ERROR_SHARE * residual_rms
         if first is None or not first.error > min_error:
             return model
@@ -103,9 +104,10 @@ class TimeStepChoice:
             log_likelihood, residual_rms = finer.rate()
             gain = log_likelihood - file_log_likelihood
             if not closes_gap_alone(gain, file_excess, residual_rms - 1.0):
-                # A step that is accurate enough for a residual of zero is exact. Then a missing
-                # effect may affect both models, and `reconsider` compares them with it. Otherwise
-                # only an exact step is tried next.
+                # A step that is accurate enough for a residual of zero is exact. If even an exact
+                # step does not close the gap, an effect may be missing in both models: the file's
+                # step is kept, and `reconsider` compares the steps with this effect. After any
+                # other step, the residual 0 makes the loop skip all steps that are not exact.
                 if refinement.is_accurate_enough(0.0):
                     break
                 residual_rms = 0.0
@@ -131,8 +133,8 @@ class TimeStepChoice:
         finding, model = result.finding, result.searched_base
         if self._refinements is None or result.has_ended:
             return result
-        # Without causes, the comparison of `choose` stands, unless something is unexplained with
-        # the file's step.
+        # Without causes, the models are those that `choose` compared, so that its choice stands.
+        # But with the file's step and an unexplained residual, a finer step is tested, too.
         if not finding.causes and (self.finding is not None or finding.verdict == "adequate"):
             return result
         # 1. Step of the file. Its runs are stored only if `choose` took a finer step.
@@ -226,6 +228,7 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
     names, fit = result.finding.model.effects, result.finding.model.fit
     evaluator, base = runs.fitting, result.searched_base.fit
     starts, has_few_effects = [], len(names) <= MAX_SUBSET_EFFECTS
+    # Smallest number of effects in a subset.
     min_count = 0 if has_few_effects else len(names)
     for count in range(min_count, len(names) + 1):
         for subset in combinations(names, count):

@@ -42,7 +42,8 @@ def build_verdict(result: SearchResult) -> Verdict:
     causes = build_causes(result)
     gains = HeldOutGainCalculator(result)
     parameters = {evaluator.parameters[i].name: numbers[i] for i in evaluator.base_indices.tolist()}
-    # Simulations for the proposal of an experiment are not part of the answer.
+    # They are counted here, because the simulations of the proposed experiment below are not part
+    # of the answer.
     simulations = evaluator.simulation_count
     if runs.validation is not None:
         simulations += runs.validation.simulations
@@ -87,7 +88,7 @@ def _build_cause(estimates: ParameterEstimates, evidence: CauseEvidence) -> Caus
     """
     evaluator = estimates.search.evaluator
     effect = evaluator.available_effects[evidence.effect]
-    # A coefficient that cannot be observed is fixed at zero and is not a result.
+    # A coefficient that cannot be observed has the range from zero to zero, and is not a result.
     coefficients = effect.on(evaluator.simulator.system)
     fixed = {c.name for c in coefficients if c.least is not None and c.least == c.most}
     fitted_values = {
@@ -117,6 +118,9 @@ def restrict_verdict(result: SearchResult) -> DiagnosisResult:
     1. A missing effect that only linear scores suggest, and that fits refute, does not count: the
        verdict becomes ``adequate``.
     2. The verdict becomes weaker if the data do not determine the coefficients of the causes.
+
+    Args:
+        result: result of the search, with the finding and the fitted models.
     """
     finding = result.finding
     if finding.verdict == "unknown" and _is_refuted(result):
@@ -129,9 +133,9 @@ def restrict_verdict(result: SearchResult) -> DiagnosisResult:
 def _are_results(estimates: ParameterEstimates, effects: Iterable[str]) -> bool:
     """Return whether the coefficients of effects are results, and no parameter is at a bound.
 
-    A result has a finite interval. A base parameter at a bound of its range counts, because a
-    cause may compensate for a value beyond the bound; one that is a result nevertheless, such
-    as zero at a physical limit, does not.
+    A result has a finite interval. A base parameter at a bound of its range makes the answer False,
+    because a cause may compensate for a value beyond the bound. The exception is a value at a bound
+    that is a result nevertheless, such as zero at a physical limit.
 
     Args:
         estimates: estimates of the found model.
@@ -168,6 +172,7 @@ def _is_refuted(result: SearchResult) -> bool:
         for model in extended_models
         if model.penalised_log_likelihood > search.base_model.penalised_log_likelihood
     ]
+    # RMS residual of the base model on the held-out runs, in units of the noise, less 1.
     excess = compute_held_out_excess(result)
     # The base model alone must leave no large gap on held-out runs. Without effects, the excess is
     # the same before and after.
@@ -206,14 +211,16 @@ def _list_candidates(search: EffectSearch, gains: HeldOutGainCalculator) -> tupl
         single_effect_model = search.models.get(frozenset({effect}))
         if single_effect_model is not None:
             score = max(score, float(single_effect_model.likelihood.value - base))
-        # The p-value compares the score with those that noise alone reaches, each minus a high
-        # quantile of such scores of its effect.
+        # The p-value compares the score with those that surrogate data without any effect reach. An
+        # effect with many shapes reaches higher ones, so the 90 % quantile of the surrogate scores
+        # of the same effect is subtracted from each score first.
         score_above_null = np.array([score - scores.null_quantiles[i]])
         p_value = float(
             np.clip(estimate_tail_p_value(scores.null_scores, score_above_null), 0.0, 1.0)
         )
         share = gains.get_closed_share((effect,))
         coefficient_count = len(search.evaluator.get_coefficient_indices(effect))
+        # This price only decides the order of the candidates, so the p-value does not have it.
         score -= search.parameter_penalty * (coefficient_count - 1)
         candidates.append(Candidate(effect, max(score, 0.0), p_value, share))
     return tuple(sorted(candidates, key=lambda candidate: -candidate.score))
@@ -223,7 +230,10 @@ def _propose_next_run(result: SearchResult) -> DiscriminatingRun | None:
     """Propose a run that distinguishes the strongest cause from its most plausible alternative.
 
     If the base model is not identifiable, the run should identify its parameters. Return None
-    if nothing is open, or if the search was stopped early.
+    if no cause has alternatives, or if the search was stopped early.
+
+    Args:
+        result: result of the search.
     """
     search, finding = result.search, result.finding
     if finding.early_stop is not None:

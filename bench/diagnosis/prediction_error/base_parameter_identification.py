@@ -116,7 +116,7 @@ def identify_base(
     search_control = evaluator.search_control
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
-        """Filter the runs with other parameters; the process noise starts from a known filter."""
+        """Filter the runs with other parameters; the process noise starts from that of `best`."""
         search_control.begin_stage("identifying the base parameters")
         return FollowedRuns.follow(evaluator, theta, noise, force=best.force)
 
@@ -141,6 +141,7 @@ def identify_base(
             bounds = limits | get_bounds_by_index(evaluator, start.effects)
             fitted = maximise_innovation_likelihood(start.followed, bounds, MAX_ITERATIONS, follow)
         except SearchStoppedError:
+            # An unfinished identification counts as none, and the search is marked as incomplete.
             search_control.record_abandoned_fit(True)
             return IdentifiedBase(followed, None)
         is_at_bound = any(bound_of(float(fitted.theta[i]), *limits[i]) for i in base_indices)
@@ -157,23 +158,37 @@ def identify_base(
             break
     if best is followed:
         return IdentifiedBase(followed, None)
-    # An estimate outside its usual range gets a range around it.
-    wider_bounds = {}
-    for i in base_indices:
-        value, (low, high) = float(best.theta[i]), evaluator.parameters[i].bounds
-        if not low <= value <= high:
-            wider_bounds[evaluator.parameters[i].name] = compute_range_around(evaluator, i, value)
-    use_bounds(evaluator, wider_bounds)
+    _widen_ranges(evaluator, best.theta)
+    # Without the effects, whose coefficients are zero in the given filter.
     theta = followed.theta.copy()
     theta[base_indices] = best.theta[base_indices]
     identified = IdentifiedParameters(theta[evaluator.base_indices], effects)
     return IdentifiedBase(follow(theta, best), identified)
 
 
+def _widen_ranges(evaluator: RunEvaluator, theta: Array) -> None:
+    """Replace the range of each base parameter that does not contain its estimate.
+
+    The new range lies around the estimate.
+
+    Args:
+        evaluator: the runs, in which the ranges are replaced.
+        theta: (P,) parameters with the estimates.
+    """
+    wider_bounds = {}
+    for i in evaluator.base_indices.tolist():
+        value, (low, high) = float(theta[i]), evaluator.parameters[i].bounds
+        if not low <= value <= high:
+            wider_bounds[evaluator.parameters[i].name] = compute_range_around(evaluator, i, value)
+    use_bounds(evaluator, wider_bounds)
+
+
 def _list_resisting_effects(followed: FollowedRuns) -> list[str]:
     """Return names of effects that resist the motion of the joints with the largest missing forces.
 
-    These are friction, drag and a constant force, as far as the evaluator has them.
+    These are friction, drag and a constant force, as far as the evaluator has them. The joints are
+    the first `MAX_JOINTS` in descending order of the loss in likelihood if the filter gets no
+    process noise there, which stands for a missing force.
 
     Args:
         followed: the runs, filtered without these effects.
@@ -224,15 +239,16 @@ def _start_with_effect(followed: FollowedRuns, best: FollowedRuns, follow: Follo
             evaluator, columns.probes, group, solution
         )
         bounds = get_bounds_by_index(evaluator, [group.effect])
+        # The coefficients of the regression alone must already gain much.
         fitted = follow(theta, followed)
         if fitted.log_likelihood - followed.log_likelihood < MIN_GAIN_SHARE * best_gain:
             continue
         fitted = maximise_innovation_likelihood(fitted, bounds, EFFECT_ITERATIONS, follow)
         # At a bound other than zero, the effect stands in for something else.
-        values = {i: float(fitted.theta[i]) for i in bounds}
-        if any(value and bound_of(value, *bounds[i]) for i, value in values.items()):
+        values = {index: float(fitted.theta[index]) for index in bounds}
+        if any(value and bound_of(value, *bounds[index]) for index, value in values.items()):
             continue
-        # The price is in twice the log-likelihood.
+        # The price, the minimum gain of an effect, is in twice the log-likelihood.
         penalty = 0.5 * regression.price(group)
         starts.append(_Start(fitted, (group.effect,), penalty, is_cause=True))
     return max(starts, key=lambda one: one.followed.log_likelihood - one.penalty, default=None)

@@ -85,10 +85,13 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
 
     Two linear laws may imitate one nonlinear law, and many coefficients of two laws one law with
     few. If a model with several effects explains the runs, or nearly, it is compared with the best
-    single effect and its competitors. That effect replaces it unless its penalised log-likelihood
-    is lower by more than `MAX_SINGLE_LOSS`. It comes from the fits of all proposed effects by
-    simulation; if they were not all fitted, from filters. If it is far worse, its competitors are
-    not fitted.
+    single effect:
+
+    1. Find the best single effect: by its fits, if all proposed effects were fitted by simulation,
+       and otherwise by filters.
+    2. Stop if it is far worse.
+    3. Fit its competitors, the effects that may act like it, and take the best of all.
+    4. Return this one unless its penalised log-likelihood is lower by more than `MAX_SINGLE_LOSS`.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -106,6 +109,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
         or context.evaluator.search_control.is_over()
     ):
         return best
+    # Each proposed effect, as a set of one name.
     proposed = [frozenset(start.effects) for start in context.proposals.list_alone()]
     if not proposed:
         return best
@@ -116,6 +120,7 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
         if 2.0 * loss > COMPETING_MODEL_MARGIN:
             return best
     else:
+        # Filters with one effect each, the likeliest first.
         single_sets = try_one_more_effect(context, filters.empty_set)
         if not single_sets:
             return best
@@ -153,6 +158,7 @@ def replace_time_shifts(context: SearchContext, best: FittedModel) -> FittedMode
     ]
     if not starts or has_series(evaluator, best.effects):
         return best
+    # The start with the lowest cost of all, as (cost, start), is the first.
     ((_, start), *_) = select_lowest_of_each(context, starts)
     return _select_improved(context, best, [context.search.fit_one(start)])
 
@@ -177,7 +183,9 @@ def replace_by_richer_laws(context: SearchContext, best: FittedModel) -> FittedM
         if not richer_laws:
             continue
         regression, own_columns = context.columns.regression(best)
+        # The regression about the model without this law.
         remaining = regression.make_regression_without(own_columns[name])
+        # The best shape of each richer law, as a group of columns; the largest gain first.
         groups = [g for g, _ in remaining.rank_effects() if g.effect in richer_laws]
         for group in groups[:MAX_RICHER_LAWS]:
             coefficients = context.columns.solve_alone(remaining, group)
@@ -193,6 +201,7 @@ def _list_richer_laws(context: SearchContext, name: str) -> list[str]:
         name: name of the effect.
     """
     effect, _, place = name.partition("@")
+    # `find_contained_slices` has the simpler laws that a law contains at the same place, by name.
     return [
         law
         for law in context.evaluator.library
@@ -238,11 +247,20 @@ def fit_competing_models(context: SearchContext, best: FittedModel) -> FittedMod
 def _find_better_competitor(context: SearchContext, best: FittedModel) -> FittedModel:
     """Fit the competing models about the best one, and return the best of all.
 
+    1. Fit the models in which another effect replaces one of the best model.
+    2. Where drives reach their force limits, fit competing single effects further.
+    3. Fit models with effects moved to related places, such as other joints of a closed loop.
+    4. Fit the models near the best to convergence.
+    5. Try one effect in place of two.
+
     Args:
-        context: search, filters and regressions of the recording.
-        best: the best model so far.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
+        best: the best model so far; it is returned if it has no effects, joints in series, or if
+            its simulation fails.
     """
     search, evaluator = context.search, context.evaluator
+    # The cost is infinite if the simulation fails. Filters do not follow joints in series.
     has_no_fit = not best.effects or not np.isfinite(best.fit.cost)
     if has_no_fit or has_series(evaluator, best.effects):
         return best
@@ -259,6 +277,8 @@ def _find_better_competitor(context: SearchContext, best: FittedModel) -> Fitted
             starts += [confirmed] if confirmed is not None else []
     if starts:
         search.refit_models(starts, is_racing=False)
+    # The fits are stored in `search.models`, from which the best model with as many effects is
+    # taken at the end.
     size = len(best.effects)
     # Jumps of the state in the linear model come from drives at their force limits.
     if size == 1 and context.filters.base.runs.jumps.any():
@@ -292,9 +312,11 @@ def _should_fit(
     fitted = context.search.models.get(frozenset(start.effects))
     if fitted is None:
         return True
-    loss = 2.0 * (best.penalised_log_likelihood - fitted.penalised_log_likelihood)
-    is_near = competing_effect.loss <= COMPETING_MODEL_MARGIN
-    return is_near and loss > COMPETING_MODEL_MARGIN + competing_effect.loss
+    # Loss of the fit, and that which the regression predicts, in twice the log-likelihood.
+    fitted_loss = 2.0 * (best.penalised_log_likelihood - fitted.penalised_log_likelihood)
+    predicted_loss = competing_effect.loss
+    is_near = predicted_loss <= COMPETING_MODEL_MARGIN
+    return is_near and fitted_loss > COMPETING_MODEL_MARGIN + predicted_loss
 
 
 def _replace_two_effects(context: SearchContext, best: FittedModel) -> FittedModel | None:
@@ -424,6 +446,7 @@ def _confirm_by_simulation(
         competing_effect: the effect, with one coefficient, that replaces one of its effects.
         start: start of a fit of the competing model; its coefficient is scaled.
     """
+    # Costs are sums of squared residuals in units of the noise.
     limit = best.fit.cost + MAX_SINGLE_SQUARES_SHARE * context.search.base_model.fit.cost
     name, factors = competing_effect.effect, np.array(COMPETING_FACTORS)
     # Readings that are late shift the first states, a command that comes late does not.
@@ -440,9 +463,10 @@ def _confirm_by_simulation(
         if cost < limit:
             return lowest
         # Index of the best factor; the starts repeat all factors for each choice of first states.
-        number = next(i for i, scaled in enumerate(starts) if scaled is lowest) % factors.size
+        best_index = next(i for i, scaled in enumerate(starts) if scaled is lowest) % factors.size
         # The ends of the new range were simulated already, so they are left out.
-        first, last = factors[max(number - 1, 0)], factors[min(number + 1, factors.size - 1)]
+        first = factors[max(best_index - 1, 0)]
+        last = factors[min(best_index + 1, factors.size - 1)]
         factors = np.geomspace(first, last, factors.size + 2)[1:-1]
     return None
 
@@ -457,16 +481,18 @@ def _confirm_by_filter(
     the loss is within the error of the linear regression, as for a family of the same forces.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         best: the best model.
         competing_effect: the effect that replaces one of its effects.
         start: start of a fit of the competing model, with the coefficients from the regression.
     """
     filters = context.filters
-    has_few = competing_effect.coefficients.size <= MAX_IMPROVED_SIZE
+    has_few_coefficients = competing_effect.coefficients.size <= MAX_IMPROVED_SIZE
     gain = filters.compute_gain(filters.get_filter(best))
+    # The margin contains the error of the linear regression, a share of the gain.
     is_near = competing_effect.loss <= compute_comparison_margin(gain)
-    steps = GAUSS_NEWTON_STEPS if has_few or is_near else 0
+    steps = GAUSS_NEWTON_STEPS if has_few_coefficients or is_near else 0
     # Better coefficients do not help an effect with which the filter follows the runs worse.
     if (
         len(start.effects) == 1
@@ -474,12 +500,13 @@ def _confirm_by_filter(
     ):
         return None
     followed, names = filters.follow_with_effects(start.theta, start.effects, steps)
-    highest = filters.get_filter(best).log_likelihood
+    best_log_likelihood = filters.get_filter(best).log_likelihood
     gained = followed.log_likelihood - filters.log_likelihood(start.theta)
-    if 0.5 * COMPETING_MODEL_MARGIN < highest - followed.log_likelihood < gained:
+    # The margin is in twice the log-likelihood.
+    if 0.5 * COMPETING_MODEL_MARGIN < best_log_likelihood - followed.log_likelihood < gained:
         # The steps gained more than what is still missing, so further steps may reach the best one.
         followed, names = filters.follow_with_effects(followed.theta, names, FURTHER_STEPS)
-    if 2.0 * (highest - followed.log_likelihood) > COMPETING_MODEL_MARGIN:
+    if 2.0 * (best_log_likelihood - followed.log_likelihood) > COMPETING_MODEL_MARGIN:
         return None
     return FitStart(names, followed.theta, start.initial_states)
 
@@ -527,7 +554,8 @@ def _add_filtered_states(context: SearchContext, starts: Iterable[FitStart]) -> 
     the readings, and so biased by neither.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         starts: starts of fits.
     """
     states = context.filters.estimate_first_states(context.filters.base)
@@ -547,6 +575,7 @@ def _refine_near(context: SearchContext, size: int) -> None:
     search, near_models = context.search, _list_models_near_the_best(context, size)
     if context.evaluator.search_control.is_over() or len(near_models) < 2:
         return
+    # Final fits end at convergence, not at the threshold of the search.
     fitter = TrajectoryFitter(
         context.evaluator, search.noise, search.fixed_parameters, is_final_fit=True
     )

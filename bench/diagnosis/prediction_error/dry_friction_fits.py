@@ -84,7 +84,8 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
     Nothing is done if the search has the soft form already, or if the base model lacks no force.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         selected: the selection.
 
     Returns:
@@ -107,7 +108,8 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
         return None
     soft_log_likelihood = filters.log_likelihood(soft_start.theta, is_soft=True)
     gain = soft_log_likelihood - filters.base.log_likelihood
-    # Another effect at the joint that promises more is fitted first.
+    # Another effect at the joint that promises more is fitted first. `effects` has the name of the
+    # soft friction only.
     if not gain > max(context.proposals.compute_largest_gain_of_others(soft_start.effects[0]), 0.0):
         return None
     # Stiff friction at this joint alone, unless it was simulated above.
@@ -123,7 +125,8 @@ def compare_friction_forms(context: SearchContext, selected: Selected) -> Fitted
         log_likelihood = filters.log_likelihood(start.theta)
         if not soft_log_likelihood > log_likelihood + MIN_LEAD:
             return None
-    # Filters are linear, so simulations of both forms decide.
+    # Filters are linear, so simulations of both forms decide. The stiff model is that at the joint
+    # of the soft friction, from one of the two fits above.
     soft_friction = refit_if_likelier_soft(
         context.search, stiff_friction, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
     )
@@ -143,7 +146,8 @@ def check_simulated_soft_friction(context: SearchContext) -> None:
     form already, or if forces are missing at several joints.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects, and `filters.reference` its parameters.
 
     Raises:
         SoftFrictionError: soft friction leaves little more than noise before any fit.
@@ -166,6 +170,7 @@ def check_simulated_soft_friction(context: SearchContext) -> None:
     if not starts:
         return
     soft_evaluator = evaluator.with_kind(make_soft_kind(evaluator.kind))
+    # The costs of whole runs; infinite if the simulation fails.
     try:
         costs = compute_start_costs(
             soft_evaluator, context.search.noise, starts, share=1.0, failed_residual=np.inf
@@ -173,6 +178,7 @@ def check_simulated_soft_friction(context: SearchContext) -> None:
     finally:
         soft_evaluator.close()
     best = int(np.argmin(costs))
+    # Below this cost, most of the residual is removed.
     if costs[best] < compute_likely_cost(context):
         raise SoftFrictionError(starts[best], is_preliminary=True)
 
@@ -207,12 +213,13 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
     best_group = groups[friction_indices[0]]
     (coefficient,) = columns.solve_alone(regression, best_group)
     sign = float(np.copysign(1.0, coefficient))
-    known = context.filters.soft_friction
-    if (best_group.effect, sign) not in known:
-        known[best_group.effect, sign] = _search_soft_friction(
+    # The search by filters is slow, so its results are cached by effect and sign.
+    cached_starts = context.filters.soft_friction
+    if (best_group.effect, sign) not in cached_starts:
+        cached_starts[best_group.effect, sign] = _search_soft_friction(
             context.filters, best_group.effect, sign
         )
-    return known[best_group.effect, sign]
+    return cached_starts[best_group.effect, sign]
 
 
 def _search_soft_friction(filters: ModelFilters, name: str, sign: float) -> FitStart | None:
@@ -231,6 +238,7 @@ def _search_soft_friction(filters: ModelFilters, name: str, sign: float) -> FitS
         Start of a fit with the likeliest force; None if friction is already soft.
     """
     base, joint_name = filters.base, name.partition("@")[2]
+    # The filter has a missing force (`force`) for each joint.
     joint_indices = {get_joint_name(filters.evaluator, j): j for j in range(base.force.size)}
     thetas = make_soft_friction_models(base, filters.reference, joint_indices[joint_name], sign)
     if not thetas:
@@ -245,6 +253,7 @@ def _search_soft_friction(filters: ModelFilters, name: str, sign: float) -> FitS
             followed[number] = filters.follow_with_soft_friction(thetas[number], similar)
         return followed[number].log_likelihood
 
+    # The log-likelihood at the two middle forces shows the direction in which it increases.
     middle = len(thetas) // 2
     step = 1 if log_likelihood(middle) > log_likelihood(middle - 1) else -1
     best = middle if step > 0 else middle - 1
@@ -293,7 +302,8 @@ def _is_far_less_likely(context: SearchContext, selected: Selected, log_likeliho
     model over the base model.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         selected: the selection.
         log_likelihood: log-likelihood of the other model.
     """
@@ -301,6 +311,7 @@ def _is_far_less_likely(context: SearchContext, selected: Selected, log_likeliho
     limit = log_likelihood - MIN_LEAD_SHARE * max(log_likelihood - base, 0.0)
     if not max(base, selected.log_likelihood) < limit:
         return False
+    # One filter is made only if the regression, which needs none, does not decide.
     first = context.columns.start(selected.groups[:1], selected.coefficients[:1])
     return context.filters.log_likelihood(first.theta) < limit
 
@@ -509,7 +520,8 @@ def make_dry_friction_start(context: SearchContext, selected: Selected) -> FitSt
     another one of them contains, such as the member of a family, is left out.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects, and `filters.reference` its parameters.
         selected: the selection.
     """
     evaluator, filters = context.evaluator, context.filters
@@ -555,7 +567,8 @@ def is_friction_sufficient(
         context.evaluator, start.effects, start.theta
     )
     stiff_log_likelihood = filters.log_likelihood(stateless_theta)
-    # Minus infinity if the search has the soft form already, or if nothing was replaced.
+    # Minus infinity for what is not compared: the soft form if the search has it already, and the
+    # selection if nothing was replaced.
     soft_log_likelihood = selected_log_likelihood = -np.inf
     if not filters.is_soft:
         soft_log_likelihood = filters.log_likelihood(stateless_theta, is_soft=True)

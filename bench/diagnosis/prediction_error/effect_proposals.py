@@ -110,7 +110,7 @@ class EffectProposals:
 
     filters: ModelFilters
     columns: LibraryColumns
-    _for_base: dict[int, ProposedEffects] = field(default_factory=dict)
+    _proposals_for_base: dict[int, ProposedEffects] = field(default_factory=dict)
     _base_steps: dict[str, tuple[Array, float]] = field(default_factory=dict)
 
     def of(
@@ -121,9 +121,9 @@ class EffectProposals:
     ) -> list[FitStart]:
         """Return models with one more effect than a set: the effects worth trying next.
 
-        Proposals by regression come first, then those of the standard joint and servo models.
-        Proposals for the base model are cached; they are made anew when candidates are added to the
-        library.
+        The models are not fitted yet. Proposals by regression come first, then those of the
+        standard joint and servo models. Proposals for the base model are cached; they are made anew
+        when candidates are added to the library.
 
         Args:
             current: the set of effects in the model, with its filter; no effects mean the base
@@ -135,12 +135,13 @@ class EffectProposals:
             Starts of fits, each with the effects of the set and one more, with a first coefficient.
         """
         # The number of candidates shows whether some were added to the library.
-        evaluator, count = self.filters.evaluator, len(self.columns.library.probes)
-        proposed = None if current.names else self._for_base.get(count)
+        evaluator, candidate_count = self.filters.evaluator, len(self.columns.library.probes)
+        is_base = not current.names
+        proposed = self._proposals_for_base.get(candidate_count) if is_base else None
         if proposed is None:
             proposed = self._propose_effects(current)
-        if not current.names:
-            self._for_base[count] = proposed
+        if is_base:
+            self._proposals_for_base[candidate_count] = proposed
         coefficients = proposed.by_regression | proposed.offset_and_friction
         if not is_fitted:
             coefficients = proposed.only_simulated | coefficients
@@ -180,9 +181,11 @@ class EffectProposals:
                 the joint where this filter misses most.
         """
         regression = self._regress(current)
+        # Names and coefficients, the largest gain first.
         ranked = list(self._propose_by_regression(regression, current.names).items())
         by_regression = dict(ranked[:MAX_REGRESSION_PROPOSALS])
-        # A filter does not follow late readings, so that the regression misjudges them.
+        # Delays and lags that may replace one of these. A filter does not follow late readings, so
+        # that the regression misjudges them.
         similar_shifts = {
             similar: coefficients
             for name, coefficients in by_regression.items()
@@ -323,8 +326,9 @@ class EffectProposals:
             float(np.abs(linear_run.trajectory.v[:, joint]).max()) for linear_run in followed.linear
         )
         interval = float(np.median(np.diff(evaluator.runs[0].times)))
-        # Sizes to try if the data give none, in the unit of each coefficient; for other effects, a
-        # share with the sign of the step. The drag is a share of the typical force at full speed.
+        # Sizes to try if the data give none, in the unit of each coefficient. Effects that are not
+        # listed get `FIRST_SHARE`, with the sign of the step. The drag is a share of the typical
+        # force at full speed.
         typical = {
             **dict.fromkeys(COMMAND_MODEL, FIRST_LAG_INTERVALS * interval),
             f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
@@ -338,7 +342,8 @@ class EffectProposals:
                 change, gain = self._compute_first_change(followed, name)
                 if name == f"drag.linear@{place}":
                     change, gain = self._compare_with_servo_damping(followed, joint, change, gain)
-                # If much process noise hides an effect, its typical size is tried.
+                # If much process noise hides an effect, its typical size is tried. The penalty is
+                # in twice the log-likelihood.
                 if not gain > 0.5 * self.filters.penalty(name):
                     change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
                 changes[name], gains[name] = np.array([change]), gain
@@ -394,6 +399,7 @@ class EffectProposals:
         evaluator, base = self.filters.evaluator, self.filters.base
         place = friction.partition("@")[2]
         joints = len(evaluator.simulator.system.coordinates)
+        # Friction at one joint always has a place of this name.
         joint = next(j for j in range(joints) if get_joint_name(evaluator, j) == place)
         others = [name for name in self._list_effects_at(joint) if name != friction]
         return max((self._compute_likelihood_step(base, name)[1] for name in others), default=0.0)
@@ -413,6 +419,7 @@ class EffectProposals:
         names = [f"{effect}@{place}" for effect in JOINT_MODEL]
         names += [f"{effect}@{list_moved_bodies(evaluator)[joint]}" for effect in LINK_MODEL]
         names += [f"{effect}@{servo}" for effect in SERVO_MODEL + SET_POINT_MODEL]
+        # `drives` has the inputs of the actuators of each joint.
         if not getattr(evaluator.simulator.system, "drives", {}).get(joint):
             names += COMMAND_MODEL
         return [name for name in names if name in evaluator.library]

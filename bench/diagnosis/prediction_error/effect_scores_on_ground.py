@@ -139,7 +139,8 @@ class OutputErrorScores:
         projected = self.simulations.project(
             np.concatenate([fitter.scale_by_noise(responses), target[..., None]], axis=3)
         )
-        # Inner products of all columns; the last one is the residual.
+        # Inner products (R, K + 1, K + 1) of all columns in each piece; the last column is the
+        # residual.
         products = projected.transpose(0, 2, 1) @ projected
         contains = {
             name: effect.contains for name, effect in context.evaluator.available_effects.items()
@@ -178,6 +179,7 @@ class OutputErrorScores:
             channel per unit of the coefficient.
         """
         evaluator, theta = self.context.evaluator, self.context.filters.base.theta
+        # Index of the coefficient in theta, and its finite change.
         index = evaluator.get_coefficient_indices(probe.effect)[probe.coefficient_index]
         step = self.simulations.get_difference(index)
         simulated = []

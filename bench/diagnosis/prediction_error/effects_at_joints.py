@@ -67,6 +67,8 @@ def get_servo_input(evaluator: RunEvaluator, joint: int) -> str:
 def acts_at_joint(evaluator: RunEvaluator, name: str, joints: Collection[int]) -> bool:
     """Return whether an effect acts at one of the given joints.
 
+    A family, one effect at all places, acts there if one of its members does.
+
     Args:
         evaluator: the runs.
         name: name of the effect.
@@ -104,6 +106,7 @@ def get_only_joint(evaluator: RunEvaluator, name: str) -> int | None:
         evaluator: the runs.
         name: name of the effect.
     """
+    # Only a family has other members.
     member, *others = members_of(evaluator.available_effects[name])
     if (
         others

@@ -34,11 +34,13 @@ def simulate_series_effects(context: SearchContext, selected: Selected) -> list[
     """Simulate elastic joints and backlash between drive and links at the most affected joints.
 
     These effects have their own states, so a regression cannot score them, and each of their trial
-    coefficients is simulated. The joints are the most affected ones without any effect and with the
-    selected ones, which may be wrong.
+    coefficients is simulated. The most affected joint is the one at which a filter needs process
+    noise most. It is taken from two filters: that of the model without effects, and that with the
+    selected effects, which may be wrong.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects, and `filters.reference` its parameters.
         selected: the selection, whose missing forces determine one of the joints.
 
     Returns:
@@ -107,6 +109,9 @@ def fit_series_effects(
 ) -> FittedModel:
     """Fit elastic joints and backlash that were not fitted before, the likeliest to convergence.
 
+    Each effect is fitted from its start. The likeliest of these models is then fitted again, with
+    restarts.
+
     Args:
         context: search, filters and regressions of the recording.
         simulated: start of each effect (`simulate_series_effects`).
@@ -129,8 +134,8 @@ def fit_series_effects(
 def add_series_effect(context: SearchContext, best: FittedModel) -> FittedModel:
     """Return a model with an elastic joint or backlash in addition, if that is likelier.
 
-    A regression does not find these effects, so that a model with the other cause of a pair is the
-    best one without them.
+    A regression does not find these effects. If one of them acts together with another effect, the
+    best model so far has the other effect only.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -138,6 +143,8 @@ def add_series_effect(context: SearchContext, best: FittedModel) -> FittedModel:
     """
     if not best.effects or has_series(context.evaluator, best.effects):
         return best
+    # The joint at which the filter of the model most needs process noise, which stands for a
+    # missing force.
     joints = {context.filters.get_filter(best).joints_by_loss[0]}
     simulated = _simulate_at_joints(context, best.fit.make_start(), joints)
     added = fit_series_effects(context, simulated, best.fit.cost)

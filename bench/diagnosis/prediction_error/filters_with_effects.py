@@ -84,9 +84,9 @@ class ModelFilters:
     models: ScoredModelSet
     numerics: float = 0.0
     soft_friction: dict[tuple[str, float], FitStart | None] = field(default_factory=dict)
-    _of_models: dict[bytes, FollowedRuns] = field(default_factory=dict)
-    _of_sets: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
-    _newest: FollowedRuns | None = None
+    _filters_by_theta: dict[bytes, FollowedRuns] = field(default_factory=dict)
+    _newest_by_effects: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
+    _newest_about_base: FollowedRuns | None = None
     _likelihoods: dict[tuple[bytes, bool], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -126,7 +126,7 @@ class ModelFilters:
 
     @property
     def base(self) -> FollowedRuns:
-        """The runs, followed with the base model."""
+        """The runs, followed with the base model, which has no effects."""
         return FollowedRuns.get_or_follow(self.evaluator, self.reference, self.noise)
 
     @cached_property
@@ -142,6 +142,7 @@ class ModelFilters:
         joints = evaluator.simulator.system.coordinates
         # A robot with a floating base has more forces than joints. `jumps` is the process noise
         # that is added where a servo reaches its limit.
+        # `force` has a missing force for each joint and each motion of a floating base.
         if (
             base.force.size != len(joints)
             or not set(joints) <= set(evaluator.channels)
@@ -180,29 +181,32 @@ class ModelFilters:
         the integrator's step errors is subtracted from the defects of the steps (by how much a step
         of the model misses the next state), so that they are not taken for a missing force. This is
         done only if the runs are then likelier: a selection of wrong effects has a wrong share.
+
+        Args:
+            model: the fitted model; without effects, the result is the filter `base`.
         """
         if not model.effects:
             return self.base
         key = model.fit.theta.tobytes()
-        if key not in self._of_models:
+        if key not in self._filters_by_theta:
             names = frozenset(model.effects)
             # The newest filter with these effects, whatever their coefficients.
-            same_effects = self._of_sets.get(names)
+            same_effects = self._newest_by_effects.get(names)
             followed = (same_effects or self.base).with_parameters(model.fit.theta)
             if same_effects is None:
                 followed = followed.with_parameters(model.fit.theta, similar=followed)
-            self._of_sets[names] = followed
+            self._newest_by_effects[names] = followed
             if self.numerics:
                 defects = followed.runs.defects - self.numerics * followed.step_errors
                 corrected = followed.refit_noise(replace(followed.runs, defects=defects))
                 if corrected.log_likelihood > followed.log_likelihood:
                     followed = corrected
-            self._of_models[key] = followed
-        return self._of_models[key]
+            self._filters_by_theta[key] = followed
+        return self._filters_by_theta[key]
 
     def get_similar_filter(self, model: FittedModel) -> FollowedRuns:
         """Return a filter with the effects of a fitted model, perhaps with other coefficients."""
-        return self._of_sets.get(frozenset(model.effects)) or self.get_filter(model)
+        return self._newest_by_effects.get(frozenset(model.effects)) or self.get_filter(model)
 
     def log_likelihood(self, theta: Array, is_soft: bool = False) -> float:
         """Return the log-likelihood of the innovations of a model; it is cached.
@@ -217,6 +221,7 @@ class ModelFilters:
         """
         if not is_soft and np.array_equal(theta, self.base.theta):
             return self.base.log_likelihood
+        # The log-likelihood is stored, and not the filter.
         key = theta.tobytes(), is_soft
         if key not in self._likelihoods:
             followed = (
@@ -246,9 +251,11 @@ class ModelFilters:
         The newest filter is kept, because a model that is likelier than the base model is asked for
         again at once, to be refined.
         """
-        if self._newest is None or not np.array_equal(self._newest.theta, theta):
-            self._newest = self.base.with_parameters(theta)
-        return self._newest
+        if self._newest_about_base is None or not np.array_equal(
+            self._newest_about_base.theta, theta
+        ):
+            self._newest_about_base = self.base.with_parameters(theta)
+        return self._newest_about_base
 
     def compute_gain(self, followed: FollowedRuns) -> float:
         """Return the gain of a filter over the base model in twice the log-likelihood."""
@@ -293,6 +300,7 @@ class ModelFilters:
             theta: (P,) parameters.
             neighbour: a filter with similar parameters, whose smoothed motion is used.
         """
+        # The newest filter about the base model's motion is cached.
         is_base = neighbour is self.base
         followed = self._follow_about_base(theta) if is_base else neighbour.with_parameters(theta)
         # Smoothed states are deviations from the motion about which the model is linear; their
@@ -313,6 +321,7 @@ class ModelFilters:
         Args:
             followed: the runs, followed by a filter.
         """
+        # The first columns are the positions.
         states = self.evaluator.initial_state_guesses.copy()
         positions = followed.get_first_positions()
         measured_positions = states[:, : positions.shape[1]]

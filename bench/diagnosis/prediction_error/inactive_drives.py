@@ -152,6 +152,7 @@ def remove_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recor
     omitted_masks = [np.zeros(run.times.size, dtype=bool) for run in runs]
     drives_without_column: list[InactiveDrive] = []
     for drive in drives:
+        # Switches tell by a column when a drive is off; a brake is not described by them.
         switches = [] if drive.is_held else _find_switches(recording, drive)
         if not switches:
             drives_without_column.append(drive)
@@ -199,6 +200,7 @@ def _format_message(
     )
     column = _find_changing_column(recording, drives)
     column_text = f"; column {column} changes there" if column else ""
+    # Example of a line of the description file; the user replaces COLUMN by the name of a column.
     name = drives[0].actuators[0]
     line = DriveSwitch(name, "COLUMN", True).line
     return (
@@ -275,6 +277,7 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
         The drives; empty if the positions of some joints are not recorded, if there is a floating
         base, if joints are coupled by equalities, or if a run is too short.
     """
+    # Only simulators of robots have this attribute.
     robot = getattr(kind, "robot", None)
     if not kind.has_model or robot is None or not has_joint_forces(robot, recording):
         return []
@@ -283,12 +286,14 @@ def find_inactive_drives(recording: Recording, kind: type[Simulator]) -> list[In
     total = sum(run.times.size for run in recording.runs)
     # Rounded up, so that at most MAX_SAMPLES samples remain.
     sample_stride = -(-total // MAX_SAMPLES)
+    # Forces that cannot be computed are NaN, and do not count.
     with np.errstate(all="ignore"):
         forces = [
             compute_joint_forces(robot, recording, run)
             for run in _thin_runs(recording, sample_stride)
         ]
     joint_actuators = [a for a in robot.actuators if a.joint is not None and a.kind != "other"]
+    # Names of the actuators of each joint, by its index.
     actuators = {
         joint_index: tuple(a.name for a in joint_actuators if a.joint == joint.name)
         for joint_index, joint in enumerate(robot.joints)
@@ -376,8 +381,11 @@ class _Intervals:
     def _accept_masks(self, masks: Sequence[Mask]) -> list[Mask]:
         """Return masks (T,) if they fulfil the conditions of the module docstring, else empty ones.
 
-        All intervals are rejected together if they are too long or too short, if the model's drive
-        is not clearly worse inside them than outside, or if the hypothesis leaves large forces.
+        The hypothesis is that the drives are off, or that a brake holds all joints. An error is the
+        force that a hypothesis leaves unexplained; that of an active drive (`ON`) is the error of
+        the model's drive. All intervals are rejected together if they are too long or too short, if
+        the model's drive is not clearly worse inside them than outside, or if the hypothesis leaves
+        large forces.
         Then single intervals that the hypothesis does not explain are removed. Samples near the
         ends of intervals are not compared, because the smoothed motion is blurred there.
 
@@ -411,6 +419,7 @@ class _Intervals:
                 drive_error_inside, drive_error_outside, drive_error_in_windows, strict=True
             )
         )
+        # Outside, the drive is active, and this error is about the force that it exerts there.
         is_small = all(
             inside <= MAX_RESIDUAL_SHARE * outside
             for inside, outside in zip(
@@ -453,11 +462,13 @@ class _Intervals:
         for run, (mask, interior_mask) in enumerate(zip(masks, interior_masks, strict=True)):
             accepted_mask = np.zeros_like(mask)
             for first, end in spans(mask):
+                # Masks of all runs that have only this interval.
                 interval_masks = [np.zeros_like(m) for m in masks]
                 interval_masks[run][first:end] = interior_mask[first:end]
                 is_explained = sum(
                     self._compute_residual_magnitudes(self.state, interval_masks)
                 ) <= MAX_STRETCH_SHARE * sum(self._compute_residual_magnitudes(ON, interval_masks))
+                # A drive that is off need not be at rest.
                 accepted_mask[first:end] = is_explained and (
                     self.state == OFF
                     or self._is_at_rest(run, interval_masks[run], (first, end), typical_speeds)
@@ -524,6 +535,7 @@ class _Intervals:
         """
         velocity = self._forces[run].velocity
         first, end = ends
+        # The interval reaches an end of the run, except for a few samples.
         at_end = first <= EDGE_SAMPLES or end >= mask.size - EDGE_SAMPLES
         is_joint_at_rest = [
             _compute_magnitude(velocity[mask, j]) <= MAX_REST_SPEED * typical_speed
@@ -551,6 +563,7 @@ def _compute_costs(residuals: Sequence[Array], state: int) -> list[Array]:
         residuals: (S, T) residual forces of each run under the S hypotheses, NaN where unknown.
         state: number of the hypothesis.
     """
+    # Two of the S rows.
     hypotheses = [ON, state]
     # Residuals (2, n) of all samples in which both are known.
     pooled_residuals = np.concatenate(residuals, axis=1)[hypotheses]

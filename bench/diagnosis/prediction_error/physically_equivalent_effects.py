@@ -92,6 +92,7 @@ def list_similar_inertias(
         return []
     law, _, place = name.partition("@")
     model, similar = simulator.robot.compiled, list[tuple[str, Array]]()
+    # The mass of a payload as a relative change of the mass of its body.
     if law == "payload":
         masses = {body.name: float(model.body_mass[body.id]) for body in simulator.robot.bodies}
         if masses.get(place, 0.0) > 0.0:
@@ -103,6 +104,7 @@ def list_similar_inertias(
         link, axis = model.body(body), model.jnt_axis[joint.id]
         (tensor,) = compute_inertia_tensors(link.iquat[None], link.inertia[None])
         moment = float(axis @ tensor @ axis)
+        # The armature adds to the moment of inertia, and the other effect changes it by a share.
         other, factor = (scale, 1.0 / moment) if name == armature else (armature, moment)
         similar.append((other, coefficients * factor))
     # Clip the coefficients to the bounds of the effects that the evaluator has.
@@ -234,6 +236,7 @@ def list_at_coupled_joints(evaluator: RunEvaluator, name: str) -> list[str]:
     joints = {get_joint_name(evaluator, joint): joint for joint in range(count)}
     if place not in joints:
         return []
+    # Each loop is a group of joint indices.
     groups = evaluator.simulator.system.loops
     others = {joint for group in groups if joints[place] in group for joint in group}
     names = [

@@ -168,7 +168,9 @@ class PredictionErrorSearch(EffectSearch):
           simulation.
         - If neither gives a result, effects are searched.
 
-        The result is also stored in `best_supported_model`, for a search that is stopped later.
+        A likely model is that of an earlier search (`self.likely`), or has the effects that were
+        identified together with the base parameters. The result is also stored in
+        `best_supported_model`, for a search that is stopped later.
 
         Raises:
             SoftFrictionError: dry friction of the data has MuJoCo's soft form.
@@ -212,7 +214,10 @@ class PredictionErrorSearch(EffectSearch):
     def _make_identified_start(self) -> FitStart | None:
         """Return a start with the effects that were identified with the base parameters.
 
-        The result is None if base parameters were not identified, or without effects.
+        The parameters of the start are those without effects (`filters.reference`, with the
+        identified base parameters), and the coefficients of the identified effects. Its first
+        states are estimated by the filter of the model without effects (`filters.base`). The result
+        is None if base parameters were not identified, or without effects.
         """
         identified, filters = self.evaluator.identified, self._search_context.filters
         if identified is None or not identified.effects:
@@ -505,9 +510,10 @@ class PredictionErrorSearch(EffectSearch):
     def take_over(self, other: PredictionErrorSearch) -> None:
         """Reuse the filter and the responses of another search of the same base model.
 
-        Both searches have the same runs. The form of the dry friction that effects add may differ,
-        since the base model has none of it. Likelihoods of other models are reused only if the
-        evaluator is the same, so that the form is.
+        Both searches have the same runs. The form of the dry friction that effects add (stiff, or
+        MuJoCo's soft form) may differ, since the base model has no effect, and so none of this
+        friction. Likelihoods of models with effects are reused only if both searches have the same
+        evaluator, and so the same form.
 
         Args:
             other: the other search.
@@ -540,6 +546,9 @@ class PredictionErrorSearch(EffectSearch):
         3. a fit by simulation, of few steps if the effect is slow to simulate.
 
         The p-value of the first test that is not significant is returned, or that of the last one.
+        In the tests 2 and 3, the gain of the effect in twice the log-likelihood has a chi-squared
+        law, and the p-value is multiplied by the number of effects in the library (Bonferroni
+        correction).
 
         Args:
             model: the fitted model; only the first test is made if its simulation fails.
@@ -629,6 +638,9 @@ class PredictionErrorSearch(EffectSearch):
         that no effect of the library describes. The signal is empty without candidates. The result
         is None for a model with joints in series, which the filter does not follow.
 
+        Candidates of the regression are the library and the hats, or the hats alone for a model
+        that was identified by filters or servo by servo (`self.identified`). Only hats are scored.
+
         Args:
             model: the fitted model.
         """
@@ -689,7 +701,8 @@ class PredictionErrorSearch(EffectSearch):
     def get_known_directions(self) -> tuple[TrajectoryFit, DirectionSet] | None:
         """Return the fit of the base model, and first-order changes of its runs by every candidate.
 
-        They are linearised about the measured motion.
+        The changes (R, T, C, K) of R runs, T samples and C channels are those by a unit of the
+        coefficient of each of K candidates, linearised about the measured motion.
         """
         library = self._search_context.columns.library
         base = self._search_context.filters.base

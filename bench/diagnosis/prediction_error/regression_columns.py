@@ -132,8 +132,9 @@ class LibraryColumns:
     def select_with_shapes(self, selected: Selected) -> Selected:
         """Select again with effects of many shapes, at the joints where a force is missing.
 
-        These effects, such as forces of any period, are many and slow to test, so they are left out
-        of the first selection.
+        A force is missing at a joint if the filter needs process noise there. These effects, such
+        as forces of any period, are many and slow to test, so they are left out of the first
+        selection.
 
         Args:
             selected: the first selection.
@@ -237,6 +238,7 @@ class LibraryColumns:
         )
         responses = compute_sensitivities(followed, columns)
         # The columns of an effect begin with the effect as it is.
+        # `first_column` is the column of this response.
         indices, derivatives, first_column = list[int](), [], 0
         for name, (whole_change, *displaced) in zip(start.effects, tangents, strict=True):
             for k, probe in enumerate(displaced):
@@ -338,6 +340,8 @@ def _make_tangent_probes(
         theta: (P,) parameters of the model, with its coefficients.
     """
     coefficients = theta[evaluator.coefficient_slices[name]]
+    # A single size: the response is not divided by the coefficient. Each probe has a grid point of
+    # its own, here 0 and below 1, 2, ..., so that they form no group.
     probes = [
         CandidateDirection(name, 0, 0, coefficients, can_be_negative=True, is_single_size=True)
     ]

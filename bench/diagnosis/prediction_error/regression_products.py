@@ -30,11 +30,11 @@ class GramMatrices:
     """
 
     def __init__(self, grams: Array, crosses: Array, totals: Array) -> None:
-        """Take known matrices.
+        """Store known products of K columns and the innovations in each of R runs.
 
         Args:
-            grams: Wᵀ W (R, K, K).
-            crosses: Wᵀ e (R, K).
+            grams: Wᵀ W (R, K, K) of the whitened responses W, the columns of a regression.
+            crosses: Wᵀ e (R, K) of the columns with the innovations e.
             totals: eᵀ e (R,).
         """
         self.grams, self.crosses, self.totals = grams, crosses, totals
@@ -79,11 +79,13 @@ class ResponseProducts:
     def __init__(
         self, responses: Sequence[NDArray[np.floating]], innovations: Sequence[Array]
     ) -> None:
-        """Compute the products with the innovations.
+        """Compute the products with the innovations, and the sums of squares of the columns.
+
+        Products of columns with each other are computed later, when they are needed.
 
         Args:
-            responses: W (N, K) of each run.
-            innovations: e (N,) of each run.
+            responses: whitened responses W (N, K) of each run: K columns of N samples.
+            innovations: whitened innovations e (N,) of each run.
         """
         self._responses, self._innovations = responses, innovations
         count = responses[0].shape[1]

@@ -163,7 +163,11 @@ class Regression:
         """Return whether the data show the first column of `always`, in addition to a set.
 
         That column is the response to the integrator's step errors. Its coefficient must be nearer
-        to one (the full error) than to zero, and it must improve the fit.
+        to one (the full error) than to zero, and it must improve the fit. `always` are columns that
+        are part of every fit, such as the derivatives by coefficients of the present model.
+
+        Args:
+            chosen: the set, with one group of columns for each effect.
         """
         # The other columns of `always` are in both fits.
         others = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
@@ -185,8 +189,11 @@ class Regression:
     ) -> LeastSquaresFit:
         """Fit a set of groups by least squares, with some coefficients that must be nonnegative.
 
-        Constrained coefficients that are negative are fixed at zero one by one, the most negative
-        (in units of the length of its column) first, and the others are fitted again.
+        A group has the columns of one effect: the responses of the whitened innovations to each of
+        its coefficients. The normal equations are G c = h, with G = W'W of the columns W and
+        h = W'e of the innovations e. Constrained coefficients that are negative are fixed at zero
+        one by one, the most negative (in units of the length of its column) first, and the others
+        are fitted again.
 
         Args:
             chosen: the groups.
@@ -233,6 +240,9 @@ class Regression:
 
         It is k log N + 2 log(M n) for k coefficients and n shapes of the effect, N samples and M
         candidate effects: the right side of eq. (2) of the module docstring.
+
+        Args:
+            group: one shape of the effect, with a column for each of its coefficients.
         """
         coefficients = len(group.column_indices) * np.log(max(self.count, 2))
         candidates = max(len(self.effects), 2) * self._shape_counts[group.effect]
@@ -256,6 +266,7 @@ class Regression:
         """
         columns = list_columns(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
+        # Residual sum of squares with the set alone.
         rss = self.solve(chosen).rss
         # Products (c, K) of the c columns of the set and of `always`, scaled to unit length, with
         # all K columns.
@@ -271,17 +282,22 @@ class Regression:
         remains = squares > COLLINEARITY_TOLERANCE * self._squares
         contained_effects = set(self._list_contained_effects(chosen))
         result = np.zeros(len(self.groups))
+        # Collinear columns get zero products, so that they explain nothing.
         cross = np.where(remains, cross, 0.0)
         # A batch has groups with the same number of columns.
         for batch, products in zip(self._batches, self._products_within_groups, strict=True):
-            projected = np.einsum("cgi,cgj->gij", rows[:, batch.columns], solved[:, batch.columns])
-            # Collinear columns get zero products, so that they explain nothing.
-            is_used = remains[batch.columns]
-            explained, _ = compute_explained_squares(
-                np.where(is_used[:, :, None] & is_used[:, None, :], products - projected, 0.0),
-                cross[batch.columns][..., None],
-                batch.positive,
+            # The part of the products (g, k, k) within the g groups that the set explains.
+            explained_by_set = np.einsum(
+                "cgi,cgj->gij", rows[:, batch.columns], solved[:, batch.columns]
             )
+            is_used = remains[batch.columns]
+            is_pair_used = is_used[:, :, None] & is_used[:, None, :]
+            grams = np.where(is_pair_used, products - explained_by_set, 0.0)
+            # Sums of squares (g, 1) that each group explains of the only residual, the innovations.
+            explained, _ = compute_explained_squares(
+                grams, cross[batch.columns][..., None], batch.positive
+            )
+            # Residual sum of squares with each group in addition.
             remaining = np.maximum(rss - explained[:, 0], SMALLEST_RSS * self.total)
             result[batch.group_indices] = self.count * np.log(rss / remaining)
         for i, group in enumerate(self.groups):
@@ -421,14 +437,14 @@ class Regression:
         return np.array(residual_squares)
 
     def prune(self, chosen: Sequence[DirectionGroup]) -> list[DirectionGroup]:
-        """Remove effects one by one whose gain is below their minimum gain (`price`).
+        """Return a set without the effects whose gain is below their minimum gain (`price`).
 
         The gain of an effect is the loss in twice the log-likelihood without it. The effect with
         the smallest gain minus price is removed first, and the gains of the others are computed
         again.
 
         Args:
-            chosen: the set, with one group of columns for each effect.
+            chosen: the set, with one group of columns for each effect; it is not changed.
         """
         remaining = list(chosen)
         while remaining:
@@ -487,7 +503,8 @@ def score_by_regression(
 ) -> CandidateScores:
     """Score effects by a regression: gains, their null distributions and p-values.
 
-    The score of an effect is the largest gain of its shapes. Under the null hypothesis each gain
+    An effect has several shapes, such as the frequencies of a periodic force, and a gain for each
+    of them. Its score is the largest gain of its shapes. Under the null hypothesis each gain
     follows a chi-squared law, so the maximum over shapes follows from draws and quantiles of it.
     The p-value of the best effect is multiplied by the number of effects (Bonferroni correction).
 
@@ -497,14 +514,14 @@ def score_by_regression(
         rng: random numbers for draws from the null distribution.
 
     Returns:
-        The scores of the effects, the highest first.
+        The scores of the effects, the highest first. The p-value is 1 if there are none.
     """
     gains = regression.gains([])
     by_effect: dict[str, list[int]] = {}
     for i, group in enumerate(regression.groups):
         if group.effect in names:
             by_effect.setdefault(group.effect, []).append(i)
-    # An effect has one group of columns for each of its shapes.
+    # The groups of an effect are its shapes.
     scored_names = list(by_effect)
     score = np.array([max(gains[i] for i in indices) for indices in by_effect.values()])
     null_quantiles, null_draws, p_values, peaks = [], [], [], []
@@ -527,7 +544,8 @@ def score_by_regression(
     quantiles = np.array(null_quantiles)
     # Draws minus the quantile of each effect, so that effects with many shapes are comparable.
     null_excesses = np.array(null_draws).reshape(-1, NULL_DRAWS) - quantiles[:, None]
-    p_value = min(len(scored_names) * min(p_values, default=1.0), 1.0)
+    # Without a scored effect nothing is significant.
+    p_value = min(len(scored_names) * min(p_values), 1.0) if p_values else 1.0
     # Innovations are white: their autocorrelation phi is zero, and scores for white noise are the
     # scores themselves.
     return CandidateScores(
@@ -593,6 +611,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
     Returns:
         The selection with the highest log-likelihood.
     """
+    # The runs, filtered with the effects of the previous selection in the linear model.
     refitted, selected_before = followed, list[DirectionGroup]()
     coefficients: list[Array] = []
     result: Selected | None = None
@@ -625,6 +644,7 @@ def identify(followed: FollowedRuns, columns: Columns, first: Regression | None 
         if has_converged:
             break
         selected_before, coefficients = selected, new_coefficients
+    # The first selection is always stored.
     assert result is not None
     return result
 
@@ -651,6 +671,9 @@ def regress(
         coefficients: coefficients of these effects.
         numerics: share of the integrator's step errors that is in the linear model.
         always: indices of probes that are part of every set, and are not candidates.
+
+    Returns:
+        The regression, with a group of columns for each shape of each effect.
     """
     # R runs, T samples, C channels, K candidates and one column for the step errors. A column of a
     # run has T C rows, one for each reading.
@@ -677,6 +700,7 @@ def regress(
         name: effect.contains for name, effect in followed.evaluator.available_effects.items()
     }
     probes = [probe for part in columns for probe in part.probes]
+    # Columns of `always` form no group, so that they are no candidates.
     groups = [g for g in group_probes(probes) if not set(g.column_indices) & set(always)]
     readings = int(followed.runs.recorded.sum())
     products = ResponseProducts(list(rows), list(innovations))
@@ -696,6 +720,8 @@ def follow_linear_with_effects(
     Their forces are subtracted from the defects (by how much a step misses the next state), and
     their changes of the readings from the residuals.
 
+    Shapes: R runs, T samples, Z states of the filter, E forces and controls.
+
     Args:
         followed: the runs, without any effect.
         columns: inputs of the candidates.
@@ -707,6 +733,7 @@ def follow_linear_with_effects(
     runs = followed.runs
     defects, residuals = runs.defects - numerics * followed.step_errors, runs.residuals
     if own_columns:
+        # Sums over the effects: inputs (R, T - 1, E) between samples, and readings (R, T, C).
         inputs, readings = columns.total(own_columns, np.concatenate(list(coefficients)))
         defects = defects - np.einsum("rtze,rte->rtz", runs.inputs, inputs)
         residuals = np.where(runs.recorded, residuals - readings, 0.0)

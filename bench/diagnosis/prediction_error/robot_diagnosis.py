@@ -85,7 +85,7 @@ class RobotDiagnosis(Diagnosis):
     def __init__(self, search: EffectSearch, held_out: Validation | None) -> None:
         super().__init__(search, held_out)
         assert isinstance(search, PredictionErrorSearch)
-        self._robot = search
+        self._robot_search = search
 
     def run(self) -> DiagnosisResult:
         """Return the result of the complete diagnosis.
@@ -100,7 +100,7 @@ class RobotDiagnosis(Diagnosis):
         Raises:
             SearchStoppedError: the search had to end early.
         """
-        search, search_control = self._robot, self._search_control
+        search, search_control = self._robot_search, self._search_control
         unfit = self.classify_unfit_base()
         if unfit is not None:
             return unfit
@@ -112,6 +112,7 @@ class RobotDiagnosis(Diagnosis):
         search_control.begin_question("rivals")
         self._model = search.fit_competing_models(self._model)
         size = len(self._model.effects)
+        # This may remove effects.
         self._evaluate_on_held_out_runs()
         if 0 < len(self._model.effects) < size:
             # The competing models of the remaining effects were fitted together with the removed
@@ -122,6 +123,7 @@ class RobotDiagnosis(Diagnosis):
         fitted = search.refit_first_states(search.refit_dry_friction(self._model))
         self._model = search.fit_to_convergence(fitted)
         lack_of_fit = assess_lack_of_fit(search, self._model)
+        # With structure in the residual, likelihoods do not decide between models.
         if not lack_of_fit.has_structure:
             self._refit_near_competitors(
                 self._model.penalised_log_likelihood - fitted.penalised_log_likelihood
@@ -163,9 +165,10 @@ class RobotDiagnosis(Diagnosis):
         Args:
             gain: what the final fit of the model gained, in twice the log-likelihood.
         """
-        search, model = self._robot, self._model
+        search, model = self._robot_search, self._model
         if model is None or gain <= 0.0:
             return
+        # Maximum distance of a competitor whose final fit may bring it close to the model.
         reach = INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO + MAX_REFIT_GAIN_RATIO * gain
         # Where servos are at their force limits, the number of first states that the data determine
         # may differ by one between fits that are not final.
@@ -189,7 +192,7 @@ class RobotDiagnosis(Diagnosis):
         Args:
             identified: the set, with the simulated model and the gain of each effect.
         """
-        search = self._robot
+        search = self._robot_search
         search_control = self._search_control
         model = identified.model
         validation = None
@@ -226,8 +229,10 @@ class RobotDiagnosis(Diagnosis):
             name: name of the effect.
             gain: its gain in twice the log-likelihood of the innovations.
         """
-        p_value = _compute_p_value(self._robot.evaluator, name, gain)
-        return CauseEvidence(name, (), p_value, gain, name)
+        p_value = _compute_p_value(self._robot_search.evaluator, name, gain)
+        return CauseEvidence(
+            effect=name, alternatives=(), p_value=p_value, gain=gain, preferred=name
+        )
 
     def _evaluate_on_held_out_runs(self) -> None:
         """Predict held-out runs with the model and its competitors, and drop unhelpful effects.
@@ -239,10 +244,11 @@ class RobotDiagnosis(Diagnosis):
         """
         if self._held_out is None or self._model is None:
             return
-        search, model = self._robot, self._model
+        search, model = self._robot_search, self._model
         self._search_control.begin_question("held_out")
         names = set(model.effects)
         if len(names) > 1:
+            # The fitted smaller models are stored in `search.models`.
             for name in model.effects:
                 search.remove_effect(model, name)
         smaller_models = [m for m in search.models.values() if set(m.effects) < names and m.effects]

@@ -183,6 +183,7 @@ def identify_servos(context: SearchContext) -> tuple[FitStart, dict[str, float]]
     all_runs = np.arange(len(evaluator.prepared_runs))
     searched_runs = np.linspace(0, all_runs.size - 1, min(SEARCHED_RUNS, all_runs.size))
     fitter = _ServoFitter(context, searched_runs.round().astype(np.intp))
+    # The joint model, before further laws are added, is needed again by `share_laws`.
     joint_model = model = fitter.fit_joint_model()
     # Joints whose last law helped, so that another one may help.
     growing_joints = set(range(len(evaluator.channels)))
@@ -280,6 +281,7 @@ class _ServoFitter:
         """
         evaluator = self._evaluator
         result: list[dict[str, str]] = []
+        # Effects with internal states have the hook "hidden".
         for places in self._places:
             names = [name for name in evaluator.library if name.partition("@")[2] in places]
             result.append(
@@ -330,6 +332,7 @@ class _ServoFitter:
         Friction is tried at all joints in one fit, since joints hardly influence each other. It is
         kept only where it helps.
         """
+        # Stiffness and damping alone, without effects.
         no_laws: list[tuple[str, ...]] = [()] * len(self._joints)
         start = self.simulate(self.context.search.base_model.fit.theta, no_laws)
         model = self.fit(start, FIRST_ITERATIONS)
@@ -338,6 +341,7 @@ class _ServoFitter:
             if DRY_FRICTION in available:
                 laws[joint] = (*laws[joint], available[DRY_FRICTION])
                 (index,) = self._evaluator.get_coefficient_indices(available[DRY_FRICTION])
+                # The fit starts from a small share of the usual range.
                 _, high = self._evaluator.parameters[index].bounds
                 theta[index] = TRIED_SHARES[0] * high
         larger = self.fit(self.simulate(theta, laws), FIRST_ITERATIONS)
@@ -450,11 +454,13 @@ class _ServoFitter:
             iterations: maximum number of steps.
             joints: the joints to fit; None for all.
         """
+        # Damping of each joint that is still fitted; `_step` changes it.
         damping = dict.fromkeys(self._joints if joints is None else joints, INITIAL_DAMPING)
         for _ in range(iterations):
             if not damping or self._evaluator.search_control.is_over():
                 break
             stepped = self._step(model, damping)
+            # No joint accepted a step.
             if stepped is None:
                 break
             decrease = model.costs - stepped.costs
@@ -517,7 +523,7 @@ class _ServoFitter:
     def _join(self, model: ServoModel, model_of_joint: Mapping[int, ServoModel]) -> ServoModel:
         """Return the model in which some joints have the parameters and laws of other models.
 
-        It is simulated, unless one of the other models has exactly these parameters.
+        The result is simulated, unless one of the other models was, with exactly these parameters.
 
         Args:
             model: the model of all other joints.
@@ -586,6 +592,7 @@ class _ServoFitter:
     def share_laws(self, model: ServoModel, joint_model: ServoModel) -> ServoModel:
         """Try the laws of the joint that improved most at all other joints.
 
+        A law is an effect without its place, such as ``drag.linear`` of ``drag.linear@elbow``.
         Robots often have the same servo at several joints, and another law at one of them may be a
         local optimum. Starts have the coefficients of that joint times several factors, with and
         without its correction of stiffness and damping. Each joint is fitted from its best start,
@@ -621,7 +628,8 @@ class _ServoFitter:
                 scaled = start.copy()
                 scaled[coefficient_indices] *= factor
                 starts.append(self.simulate(scaled, laws))
-        # All other joints stay as they are in the fitted model.
+        # All other joints stay as they are in the fitted model. Every joint gets its parameters
+        # from `others` or from its best start, so any start may be the first argument of `_join`.
         others = dict.fromkeys(set(self._joints) - set(joints), model)
         nearest_starts = {joint: min(starts, key=lambda s: s.costs[joint]) for joint in joints}
         shared = self.fit(self._join(starts[0], nearest_starts | others), SHARED_ITERATIONS, joints)
@@ -711,6 +719,7 @@ class _ServoFitter:
         # The best trial of each effect, by joint.
         trials: dict[int, dict[str, _Trial]] = {joint: {} for joint in joints}
         for law in sorted(set().union(*self._laws_at_joint)):
+            # The effect of this law at each joint that can have it and does not have it yet.
             names = {
                 joint: at_joint[law]
                 for joint, at_joint in enumerate(self._laws_at_joint)
@@ -788,9 +797,11 @@ class _ServoFitter:
         """
         gains: dict[str, float] = {}
         for joint, block in self._compute_jacobians(model, self._joints).items():
-            laws, count = model.laws[joint], int(self._mask[:, :, joint].sum())
+            laws, sample_count = model.laws[joint], int(self._mask[:, :, joint].sum())
+            # The variance is the cost divided by the number of samples.
             information = Information(
-                self._list_parameters(joint, laws), block.T @ block * count / model.costs[joint]
+                self._list_parameters(joint, laws),
+                block.T @ block * sample_count / model.costs[joint],
             )
             gains |= compute_wald_statistics(self._evaluator, model.theta, laws, information)
         penalty = self.context.filters.penalty
@@ -814,6 +825,7 @@ def _estimate_gain(block: Array, change: Array, residual: Array) -> float:
         `SCALE_LIMITS`; zero if it would have to be smaller.
     """
     low, high = SCALE_LIMITS
+    # Parameters without influence on the samples are left out of the basis.
     norms = np.linalg.norm(block, axis=0)
     basis, _ = np.linalg.qr(block[:, norms > 0.0] / norms[norms > 0.0])
     projected_change = change - basis @ (basis.T @ change)

@@ -100,6 +100,7 @@ class SettledSimulations:
             # A simulation may diverge.
             if not np.isfinite(columns).all():
                 break
+            # The columns are derivatives of the residual itself, so the step cancels it.
             change = np.linalg.lstsq(np.stack(columns, axis=1), -residual, rcond=None)[0]
             changed = theta.copy()
             for (index, (low, high)), value in zip(bounds.items(), change.tolist(), strict=True):
@@ -159,6 +160,7 @@ class SettledSimulations:
         Returns:
             The projected values (R, n, K). The first T C of the n rows are the readings.
         """
+        # Orthonormal columns (R, n, 2 D) that span what first states explain, Q of (1).
         bases = self.fitter.factors.q
         runs, samples, channels, count = values.shape
         # The rows after the readings are those of the prior of first states, and stay zero.
@@ -185,7 +187,7 @@ def estimate_settled_start(evaluator: RunEvaluator, noise: NoiseModel, start: Fi
     Returns:
         The start; the given one for elastic joints, or if the filter diverges.
     """
-    # Elastic joints have states that no reading shows; their fits begin as given.
+    # Elastic joints have states that no reading shows, and a filter does not follow them.
     if has_series(evaluator, start.effects):
         return start
     # The first states of the base model are biased by what is missing.
@@ -193,6 +195,7 @@ def estimate_settled_start(evaluator: RunEvaluator, noise: NoiseModel, start: Fi
     if not followed.has_expected_innovations:
         return start
     states, fitter = followed.improved_first_states, followed.first_state_fitter
+    # First the coefficients with these first states, then the first states again.
     refined = SettledSimulations(fitter, states).refine(start)
     refined_states = fitter.fit_settled_states(refined.theta, states)
     cost = fitter.compute_squares(start.theta, states).sum()
@@ -228,8 +231,10 @@ def refine_with_wide_differences(
     residual = fitter.simulate_residuals(theta, states)
     squares = _sum_squares(residual)
     jacobian = fit.jacobian.copy()
+    # Quotients in units of the noise, and the indices in theta of their coefficients.
     columns, indices = list[Array](), list[int]()
     for column, index in enumerate(fit.free_indices.tolist()):
+        # Other parameters keep their derivatives by small differences.
         if index not in bounds:
             continue
         indices.append(index)
@@ -242,6 +247,8 @@ def refine_with_wide_differences(
         columns.append(np.nan_to_num(fitter.scale_by_noise(quotient)).reshape(-1))
     if not columns or not np.isfinite(squares):
         return fit
+    # (n, k) for all n samples and k coefficients. The residual is the readings minus the simulated
+    # ones, so that the step d solves J d = r.
     derivatives = np.stack(columns, axis=1)
     for _ in range(MAX_WIDE_STEPS):
         step = np.linalg.lstsq(derivatives, np.nan_to_num(residual).reshape(-1), rcond=None)[0]

@@ -89,7 +89,8 @@ def fit_by_simulation(
        Where servos reach their force limits, this is done for all small effects.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         start: the effects, with first parameters and initial states.
         is_incomplete: whether a filter shows that a force is missing in addition to the effects.
 
@@ -141,8 +142,8 @@ def fit_states_alone(context: SearchContext, model: FittedModel) -> TrajectoryFi
 def simulate_identified(context: SearchContext, start: FitStart) -> FittedModel:
     """Simulate the runs with identified parameters, from fitted initial states.
 
-    Only the initial states are fitted, in a few iterations. The fit with the derivatives by all
-    parameters, which the search needs, then makes no step.
+    Only the initial states are fitted, in a few iterations. A second fit makes no step (zero
+    iterations): it only computes the derivatives by all parameters, which the search needs.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -171,6 +172,9 @@ def make_filtered_start(context: SearchContext, current: FilteredSet) -> FitStar
 
 def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:
     """Fit a set by simulation, starting from the coefficients of its filter; the fit is cached.
+
+    A set is a group of effects in the model of a Kalman filter. The filter also tells whether a
+    force is still missing; then a fit that leaves much of the residual is not repeated.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -205,7 +209,8 @@ def list_nearby_starts(context: SearchContext, model: FittedModel, name: str) ->
     beyond. Initial states are those of the fit, or those that were measured.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         model: the fitted model.
         name: name of the effect.
     """
@@ -225,7 +230,8 @@ def list_nearby_starts(context: SearchContext, model: FittedModel, name: str) ->
 def select_lowest_of_each(context: SearchContext, starts: Sequence[FitStart]) -> list[RatedStart]:
     """Simulate starts, and return the one with the lowest cost for each set of effects.
 
-    Simulating all starts once, without a fit, is cheap. Only these best starts are then fitted.
+    Simulating all starts once over the whole runs, without a fit, is cheap. Only these best starts
+    are then fitted.
 
     Args:
         context: search, filters and regressions of the recording.
@@ -254,7 +260,8 @@ def compute_likely_cost(context: SearchContext) -> float:
     beyond noise.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
     """
     noise = float(context.filters.base.runs.recorded.sum())
     return noise + MAX_SINGLE_SQUARES_SHARE * max(context.search.base_model.fit.cost - noise, 0.0)
@@ -263,8 +270,12 @@ def compute_likely_cost(context: SearchContext) -> float:
 def has_noise_like_cost(context: SearchContext, rated_starts: Sequence[RatedStart]) -> bool:
     """Return whether the best of some simulated starts leaves little more than noise without a fit.
 
+    This is the case if its mean squared residual, in units of the noise, is below
+    `MAX_NOISE_LIKE_COST`.
+
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         rated_starts: costs and starts in ascending order of the cost; there may be none.
     """
     if not rated_starts:
@@ -282,7 +293,8 @@ def is_explained(context: SearchContext, model: FittedModel) -> bool:
     MuJoCo's soft form (`filters.is_soft` if the simulator has that form already).
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         model: the fitted model.
     """
     if is_at_noise(context, model):
@@ -305,7 +317,8 @@ def is_at_noise(context: SearchContext, model: FittedModel) -> bool:
     `NEGLIGIBLE_EXCESS` for a robot on the ground, whose simulated contacts creep.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         model: the fitted model.
     """
     limit = NEGLIGIBLE_EXCESS if context.filters.base.is_on_ground else EXPLAINED_EXCESS
@@ -454,7 +467,8 @@ def drop_surplus_effects(
     enough.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         selected: the selection, in the order in which effects were added.
         is_simulated: whether the set is kept for a simulation, so that the trials also end when it
             is too slow to simulate.

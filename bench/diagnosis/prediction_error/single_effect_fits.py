@@ -74,7 +74,8 @@ def list_likely_starts(context: SearchContext) -> list[RatedStart]:
     joint.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
 
     Returns:
         Costs and starts with one effect each, in ascending order of the cost (sum of squared
@@ -102,6 +103,7 @@ def _drop_families(context: SearchContext, rated_starts: Sequence[RatedStart]) -
         context: search, filters and regressions of the recording.
         rated_starts: costs and starts with one effect each.
     """
+    # Costs by the names of the effects, here tuples of one name.
     costs = {rated.start.effects: rated.cost for rated in rated_starts}
     effects = context.evaluator.available_effects
     remaining = []
@@ -135,6 +137,7 @@ def _try_scaled(
         (name,) = start.effects
         if len(context.evaluator.get_coefficient_indices(name)) == 1:
             scaled += [scale_effect(context.evaluator, start, name, factor) for factor in factors]
+    # The best start of each effect, at first the given one.
     lowest = {rated.start.effects: rated for rated in rated_starts}
     for rated in select_lowest_of_each(context, scaled):
         if rated.cost < lowest[rated.start.effects].cost:
@@ -158,6 +161,7 @@ def fit_likely_effects(context: SearchContext, likely_starts: Sequence[RatedStar
     """
     best = context.search.base_model
     scanned = list(likely_starts[:MAX_SCANNED])
+    # Closer factors are not needed once a start leaves little more than noise.
     for factors in CLOSER_FACTORS:
         if not has_noise_like_cost(context, scanned):
             scanned = _try_scaled(context, scanned, factors)
@@ -180,7 +184,8 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     joint are left out if a force is missing at another joint.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
 
     Returns:
         The best model if it explains the runs, without an effect that gains too little; otherwise
@@ -192,7 +197,8 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     """
     search, filters = context.search, context.filters
     states = filters.estimate_first_states(filters.base)
-    # The maximum number of proposals is that of these effects, so that none is left out.
+    # All effects that may be proposed at a joint. Their number is the maximum number of proposals,
+    # so that none is left out.
     effects_at_joint = JOINT_MODEL + LINK_MODEL + SERVO_MODEL + SET_POINT_MODEL
     starts = context.proposals.list_alone(len(effects_at_joint))
     if not starts:

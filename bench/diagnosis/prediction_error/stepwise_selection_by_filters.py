@@ -213,6 +213,7 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
     search_control = context.evaluator.search_control
     filters = context.filters
     base = context.search.base_model
+    # The base model, with the empty set of effects.
     current = filters.empty_set
     if friction is not None:
         current = filters.follow_with_effects(friction.theta, friction.effects)
@@ -221,6 +222,7 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
         # No effect pays, but soft dry friction may: raise an error if it does.
         check_filter(context, current.followed.log_likelihood)
         return base
+    # Step 2, or dry friction alone if no effect pays in addition to it.
     best = base if larger_sets else fit_filtered(context, current)
     for larger_set in _select_nearly_as_likely(context, larger_sets):
         if not filters.act_where_forces_are_missing(larger_set.names):
@@ -252,7 +254,10 @@ def _grow_set(context: SearchContext, current: FilteredSet) -> FilteredSet:
 
     Args:
         context: search, filters and regressions of the recording.
-        current: the set to begin with.
+        current: the set to begin with, a group of effects in the model of a Kalman filter.
+
+    Returns:
+        The largest set, with its filter; `current` itself if no effect is added.
     """
     # Number of the last effects in a row that replace no missing force.
     imitations = 0
@@ -282,10 +287,12 @@ def _list_larger_that_pay(context: SearchContext, current: FilteredSet) -> list[
     effects gain more than the penalty. The likeliest set is the first.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         current: the set to extend by one effect.
     """
     filters = context.filters
+    # An empty set is the base model.
     present = current.followed if current.names else filters.base
     min_share_gain = MIN_FURTHER_GAIN_SHARE * filters.compute_gain(present)
     return [
@@ -327,14 +334,20 @@ def try_one_more_effect(context: SearchContext, current: FilteredSet) -> list[Fi
 def _compare_larger_sets(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
     """Return the likeliest sets with one more effect, with improved coefficients, the best first.
 
+    Proposed effects are tried in two parts, those with the largest gains by regression first. The
+    second part is not tried if the best effect of the first one replaces a missing force. At most
+    `MAX_IMPROVED_TRIALS` sets are returned.
+
     Args:
         context: search, filters and regressions of the recording.
-        current: the set.
+        current: the set to extend by one effect.
     """
+    # Models with one more effect, those that regression proposes first.
     starts = context.proposals.of(current)
     context.evaluator.search_control.begin_stage(
         "testing the effects of the model one by one", len(starts)
     )
+    # All sets that were filtered so far, and the best of them with improved coefficients.
     followed, compared = list[FilteredSet](), list[FilteredSet]()
     # First the effects with the largest gains by regression, then all others.
     for part in (starts[:MAX_IMPROVED_TRIALS], starts[MAX_IMPROVED_TRIALS:]):
@@ -380,11 +393,12 @@ def _improve_likeliest(
     def compute_criterion(larger_set: FilteredSet) -> float:
         return _compute_criterion(context, larger_set)
 
-    known = {larger_set.names: larger_set for larger_set in improved}
+    improved_by_names = {larger_set.names: larger_set for larger_set in improved}
     compared = list[FilteredSet]()
     for larger_set in sorted(followed, key=compute_criterion)[:MAX_IMPROVED_TRIALS]:
-        if larger_set.names in known:
-            larger_set = known[larger_set.names]
+        if larger_set.names in improved_by_names:
+            larger_set = improved_by_names[larger_set.names]
+        # The best set so far comes first; one that is far worse stays as it is.
         elif not compared or not _is_settled(context, compared[0], larger_set):
             larger_set = context.filters.improve(larger_set)
         compared.append(larger_set)
@@ -402,6 +416,7 @@ def _compute_remaining_share(current: FilteredSet, larger: FilteredSet) -> float
         current: the set; the result is infinite if no force is missing with it.
         larger: the set with one more effect.
     """
+    # Mask of the joints where the filter needs process noise.
     missing = current.followed.missing_forces
     shares = larger.followed.force[missing] / current.followed.force[missing]
     return float(shares.min(initial=np.inf))
@@ -454,6 +469,7 @@ def _select_nearly_as_likely(
     near_sets = [
         larger_set for larger_set in larger_sets if _compute_criterion(context, larger_set) <= limit
     ]
+    # The near sets are the first ones of `larger_sets`; the next ones follow up to the minimum.
     return [*near_sets, *larger_sets[len(near_sets) : MAX_FIRST_EFFECTS]]
 
 
@@ -478,16 +494,19 @@ def _fit_all_servos(context: SearchContext, likeliest: FilteredSet) -> FittedMod
     then returned, and also if the library has no effects of all servos.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects, and `filters.reference` its parameters.
         likeliest: the likeliest set with one effect.
     """
     names = [f"{effect}@*" for effect in SERVO_MODEL]
     filters = context.filters
+    # With neither of them, the filter lacks a force at one joint only.
     are_missing_at_several = all(
         followed.missing_forces.sum() > 1 for followed in (filters.base, likeliest.followed)
     )
     if not are_missing_at_several or not set(names) <= set(context.evaluator.library):
         return context.search.base_model
+    # The coefficients begin at zero, those of the model without effects.
     return fit_filtered(
         context, filters.follow_with_effects(filters.reference, names, ALL_SERVOS_STEPS)
     )
@@ -566,7 +585,8 @@ def _follow_joint_model(context: SearchContext, friction: FitStart) -> FilteredS
         The set of the remaining effects, with its filter.
     """
     filters, evaluator = context.filters, context.evaluator
-    # Effects of the joint model other than the friction, for all joints (``@*``).
+    # Effects of the joint model other than the friction, for all joints (``@*``). Their
+    # coefficients begin at zero, as in the parameters of the friction.
     others = [
         name
         for name in (f"{effect}@*" for effect in JOINT_MODEL)
@@ -686,7 +706,8 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
     long run.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
 
     Returns:
         The identified set; None if the runs are short or nearly explained, if no effect pays, or
@@ -708,6 +729,7 @@ def identify_incomplete(context: SearchContext) -> IdentifiedSet | None:
     for _ in range(MAX_ADDED_TO_TEXTBOOK):
         if _leaves_negligible_force(context, current):
             break
+        # The responses are computed only if an effect is missing.
         columns = columns or _list_single_effects(context)
         larger = _add_next_effect(context, current, columns)
         if larger is None:
@@ -736,7 +758,8 @@ def _leaves_negligible_force(context: SearchContext, current: FilteredSet) -> bo
     Missing forces are the standard deviations of the process noise of a filter.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         current: the set, with its filter.
     """
     limits = NEGLIGIBLE_FORCE_SHARE * context.filters.base.force
@@ -765,7 +788,8 @@ def _fit_with_base_parameters(
     They end when a step gains little compared with the gain over the base model so far.
 
     Args:
-        context: search, filters and regressions of the recording.
+        context: search, filters and regressions of the recording; `filters.base` is the filter of
+            the model without effects.
         followed: the runs, filtered with the parameters from which the fit starts.
         names: names of the effects.
     """
@@ -842,6 +866,7 @@ def _prune_set(
     theta = followed.theta.copy()
     for name in set(current.names) - set(names):
         theta[context.evaluator.coefficient_slices[name]] = 0.0
+    # The coefficients of removed effects may have been zero already.
     if not np.array_equal(theta, followed.theta):
         followed = followed.with_parameters(theta)
     if lost_gain > 2.0 * MIN_STEP_GAIN:
@@ -890,7 +915,9 @@ def _add_next_effect(
 def _list_single_effects(context: SearchContext) -> Columns:
     """Return the columns of the effects that may be added: at one place, with few coefficients.
 
-    Candidates of the library are effects with few shapes; their families (``@*``) are left out.
+    A column is the response of the runs to one trial coefficient of an effect. Left out are
+    families, one effect at all places (``@*``), effects with more than `MAX_IMPROVED_SIZE`
+    coefficients, and effects with many shapes, which `columns.library` does not have.
 
     Args:
         context: search, filters and regressions of the recording.

@@ -67,7 +67,7 @@ def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
     if not has_placed_causes(report):
         return [RankedCandidate(candidate) for candidate in ordered_candidates]
     causes = {cause.effect for cause in report.verdict.causes}
-    # Candidates by the name of their effect without its place.
+    # Candidates by the name of their effect without its place, the highest score first in each.
     candidates_by_effect: dict[str, list[Candidate]] = {}
     for candidate in ordered_candidates:
         base, _ = split_effect_name(candidate.effect)
@@ -102,6 +102,9 @@ def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
 
     At most `MAX_SHOWN_CANDIDATES` are shown, unless there are more causes: candidates that are not
     needed are left out, those with the lowest scores first.
+
+    Args:
+        report: content of the report, with candidates and causes.
     """
     ordered_candidates = [entry.best for entry in rank_candidates(report)]
     unneeded_candidates = [
@@ -109,6 +112,7 @@ def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
     ]
     # Diagnosed causes and their alternatives are shown even with a low score.
     needed_count = len(ordered_candidates) - len(unneeded_candidates)
+    # The remaining rows are for the best of the others.
     hidden_candidates = unneeded_candidates[max(0, MAX_SHOWN_CANDIDATES - needed_count) :]
     return [c for c in ordered_candidates if c not in hidden_candidates]
 
@@ -116,9 +120,16 @@ def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
 def build_candidate_table(report: DiagnosisReportData) -> Table:
     """Build a table with one row per candidate, the highest score first.
 
-    `set` names the candidates that the data cannot distinguish from it. `shown` says which rows are
-    visible at first: of an effect that acts at several places, only the best one. Columns that
-    would be empty are left out.
+    The columns include
+
+    * `standing`: the status of the candidate, for example that it is found or not needed;
+    * `set`: the candidates that the data cannot distinguish from it;
+    * `kind`, `place` and `joint`: where it acts, and the joint to which this place belongs;
+    * `shown`: whether the row is visible at first; of an effect that acts at several places, only
+      the representative one is;
+    * `says`: its description.
+
+    Columns that would be empty are left out.
 
     Args:
         report: Data of the report.

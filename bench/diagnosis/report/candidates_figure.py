@@ -97,7 +97,7 @@ def draw_candidates_figure(report: DiagnosisReportData) -> Figure:
     """
     candidates = select_shown_candidates(report)
     names = [_format_candidate_name(report, candidate) for candidate in candidates]
-    # The left panel needs the share of enough candidates, and any candidate.
+    # The left panel needs at least one candidate, and the shares of enough of them.
     simulated_count = sum(candidate.heldout_gain is not None for candidate in candidates)
     has_shares = simulated_count >= MIN_SIMULATED_SHARE * len(candidates) > 0
 
@@ -214,7 +214,7 @@ def _draw_shares(axis: Axes, report: DiagnosisReportData, candidates: Sequence[C
         share = candidate.heldout_gain
         if share is None:
             continue
-        # Very negative shares are drawn at the edge; the text has the value.
+        # Shares below `LOWEST_SHARE` are drawn there, at the edge; the text has the value.
         position = max(share, LOWEST_SHARE)
         interval = report.share_intervals.get(candidate.effect)
         if interval is not None:
@@ -301,9 +301,11 @@ def _draw_scores(
     for row, (candidate, text) in enumerate(zip(candidates, texts, strict=True)):
         size = max(candidate.score, 0.0)
         bar_style = dict(_BARS[get_candidate_status(report, candidate.effect)])
+        # A white bar means an insignificant score.
         if _is_insignificant(report, candidate):
             bar_style["facecolor"] = "white"
         axis.barh(row, size, height=thickness, edgecolor=NEUTRAL_MARK, linewidth=0.6, **bar_style)
+        # Scores of the effect at the places that this candidate represents.
         other_scores = [max(other.score, 0.0) for other in other_places.get(candidate.effect, ())]
         axis.plot(
             other_scores,

@@ -264,9 +264,10 @@ def _group_effects(names: Sequence[str], conjunction: str) -> list[str]:
         first_name = group[0]
         _, place = split_effect_name(first_name)
         if len(group) == 1 and place not in ("", ALL_PLACES):
-            # It shares a text with other effects at this place.
+            # The effect has one place only: it shares a text with other such effects at this place.
             key = f"{get_place_kind(first_name)} {place}"
         else:
+            # Several places, none or all: the effect has a text of its own.
             key = first_name
         by_place.setdefault(key, []).extend(group)
     return [_format_effect_group(group, conjunction) for group in by_place.values()]
@@ -326,7 +327,11 @@ def strip_place(description: str) -> str:
 def format_causes(causes: Sequence[Cause]) -> str:
     """Format the causes; those with alternatives come last.
 
-    For example ``wind, and linear drag or Coulomb friction``.
+    For example ``wind, and linear drag or Coulomb friction``: wind is certain, and one of the other
+    two, which the data cannot distinguish, is a cause.
+
+    Args:
+        causes: Causes of the verdict.
     """
     certain_names = [format_effect(cause.effect) for cause in causes if not cause.alternatives]
     parts = [joined(certain_names)] if certain_names else []
@@ -349,7 +354,7 @@ def format_missing_causes(causes: Sequence[Cause], with_alternatives: bool = Tru
         causes = [replace(cause, alternatives=()) for cause in causes]
     # Parts of the sentence by their verb.
     lacks, has, either = [], [], []
-    # Causes without alternatives share one list; each other cause has its own "or" list.
+    # Causes without alternatives share one list with "and"; each other cause has a list with "or".
     certain = [cause.effect for cause in causes if not cause.alternatives]
     if missing_names := [name for name in certain if not is_parameter_error(name)]:
         lacks.append(joined([format_effect(name) for name in missing_names]))
@@ -403,6 +408,7 @@ def format_number_error(cause: Cause) -> str:
     coefficients = list(cause.coefficients.values())
     if base not in MODEL_FILE_ERRORS or place in ("", ALL_PLACES) or not coefficients:
         return ""
+    # The texts of scalar errors use the first coefficient, those of vectors the norm of all.
     first = coefficients[0]
     # Length of a displacement, or angle of a rotation vector in rad.
     norm = float(np.linalg.norm([coefficient.value for coefficient in coefficients]))
@@ -440,15 +446,18 @@ def format_cause_with_values(cause: Cause) -> str:
 
 
 def format_values(cause: Cause) -> str:
-    """Format the coefficients of a cause in one line.
+    """Format the values of the coefficients of a cause in one line.
 
     If the cause is one effect at all joints or bodies (a family), each coefficient is followed by
     the joint or body at which it acts.
+
+    Args:
+        cause: Cause with its coefficients; those of a family are named ``COEFFICIENT@PLACE``.
     """
     texts = []
     for name, text in list_values(cause):
         coefficient, place = split_effect_name(name)
-        # The default name says nothing if the place identifies the coefficient.
+        # The default name "coefficient" says nothing if the place identifies the coefficient.
         prefix = "" if place and coefficient == "coefficient" else f"{coefficient} "
         texts.append(f"{prefix}{text}" + (f" at {place}" if place else ""))
     return joined(texts)
@@ -459,6 +468,9 @@ def list_values(cause: Cause) -> list[tuple[str, str]]:
 
     The list is empty for an option of the simulator that is a word, such as an integrator. A
     corrected time step was chosen and not estimated, so it has no interval.
+
+    Args:
+        cause: Cause with its coefficients by name.
     """
     if cause.effect in ("numerics.integrator", "numerics.cone", "numerics.solver"):
         return []
@@ -500,7 +512,11 @@ def format_coefficient_label(cause: Cause, effect: str, place: str) -> str:
 def format_fitted_value(fitted: FittedValue) -> str:
     """Format a fitted number with its interval and unit, or the bound that it is at.
 
-    The resulting value in the model file, and a value outside the usual range, are added.
+    If the number corrects one of the model file, the resulting number is added. If the value is
+    outside its plausible range, this range is added.
+
+    Args:
+        fitted: Value with its interval and unit.
     """
     text = append_unit(format_estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
     if fitted.at_bound is not None:

@@ -110,7 +110,8 @@ def name_missing_physics(
     if isinstance(explanation, tuple):
         if_increasing, if_decreasing = explanation
         explanation = if_increasing if is_increasing else if_decreasing
-    # An explanation by an effect of the library ends with its name in parentheses.
+    # An explanation by an effect of the library ends with its name in parentheses; otherwise
+    # `effect` is empty, which no effect of the model is.
     effect = explanation.partition("(")[2].rstrip(")")
     known_names = {known_effect.partition("@")[0] for known_effect in known_effects}
     if not explanation or effect in known_names:
@@ -140,6 +141,7 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
         report: Report data. Its consistency has, before and after the causes are added, a
             `ParameterConsistency` for each parameter and grouping (a spread).
     """
+    # By name of the parameter, and criterion of the groups: run, log or a constant such as a load.
     before = {(spread.number, spread.by): spread for spread in report.consistency.before}
     after = report.consistency.after
     effects = [cause.effect for cause in report.verdict.causes]
@@ -159,7 +161,7 @@ def format_consistency(report: DiagnosisReportData) -> list[str]:
         inconsistent=_select_clearest([spread for spread in after if not spread.is_consistent]),
         after=after,
         logs=logs,
-        # The level is corrected for the number of parameters.
+        # Bonferroni correction: the level is divided by the number of tested parameters.
         drifting=[
             spread
             for spread in logs
@@ -229,7 +231,7 @@ def build_consistency_rows(report: DiagnosisReportData) -> list[tuple[object, ..
     """Build the rows of `AGREEMENT_COLUMNS`: joint fit and groups, with 95 % intervals.
 
     Each parameter has a row "all" for the joint fit, one for each group of runs, and a row
-    "another" with the prediction interval of a further group.
+    "another" with the interval in which the value of a group that is not yet recorded would lie.
 
     Args:
         report: Data of the report, with the consistency of the base and the extended model.

@@ -23,10 +23,13 @@ MAX_NAMED_CHANNELS = 6
 
 
 def list_detectable_gaps(report: DiagnosisReportData) -> list[tuple[ChannelInfo, float]]:
-    """List the channels with the largest gap, in their units, that the noise could hide in each.
+    """List the channels, each with the largest gap that its noise could hide, in its unit.
 
     A channel with too few samples is left out. With many channels, only the worst one of each kind
-    is listed.
+    (positions, velocities, ...) is listed.
+
+    Args:
+        report: Data of the report.
     """
     sizes = zip(report.channels, compute_detectable_gap(report).tolist(), strict=True)
     return _select_worst_of_each_kind(
@@ -43,7 +46,7 @@ def _select_worst_of_each_kind(
     Up to `MAX_NAMED_CHANNELS` channels are all kept.
 
     Args:
-        sizes: Channels with the smallest gap that would be detected in them, in their units.
+        sizes: Channels with the largest gap that their noise could hide, in their units.
     """
     if len(sizes) <= MAX_NAMED_CHANNELS:
         return list(sizes)
@@ -78,7 +81,8 @@ def compute_detectable_gap(report: DiagnosisReportData) -> Array:
     """
     sizes = []
     for channel_index, channel in enumerate(report.channels):
-        residual_runs: list[Array] = []  # (T,) each, NaN where a sample is missing.
+        # Residuals of each fitted and held-out run, (T,) in units of the noise, NaN where missing.
+        residual_runs: list[Array] = []
         for split in report.data_splits:
             split_residual = (split.observed - split.before)[:, :, channel_index]
             residual_runs += [*(split_residual / channel.sigma)]
@@ -88,12 +92,13 @@ def compute_detectable_gap(report: DiagnosisReportData) -> Array:
             sizes.append(np.nan)
             continue
         square = float(np.mean(residuals**2))
-        # Products use neighbours within a run; a product with a missing sample is NaN.
+        # Neighbours must be of the same run; a product with a missing sample is NaN.
         products = np.concatenate([run[1:] * run[:-1] for run in residual_runs])
         phi = 0.0
         if np.isfinite(products).any() and square:
             phi = float(np.clip(np.nanmean(products) / square, 0.0, MAX_PHI))  # (1)
         effective_samples = residuals.size * (1.0 - phi**2) / (1.0 + phi**2)  # (2)
+        # d in (3); the noise that a recording states has no error.
         noise_error = (
             0.0 if channel.stated else 2.0 * NOISE_ESTIMATE_ERROR_FACTOR / residuals.size**0.5
         )

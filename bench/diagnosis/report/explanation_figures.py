@@ -54,7 +54,12 @@ _STYLE: dict[Any, Any] = {
 
 
 def list_figure_names(report: DiagnosisReportData) -> tuple[str, ...]:
-    """List the names of the figures for which there are data."""
+    """List the names of the figures for which there are data.
+
+    Args:
+        report: Report data. Only a robot has a drawing, and the figures ``where`` and
+            ``candidates`` need a gap location and a candidate to show.
+    """
     is_available = {
         "robot": report.robot is not None,
         "overview": True,
@@ -93,7 +98,8 @@ def render_figures(report: DiagnosisReportData) -> dict[str, FigureFiles]:
     Returns:
         PNG, and PDF and SVG if requested, of each figure by name.
     """
-    # The settings must stay active, because text is laid out again when a figure is written.
+    # The style must stay active until the end, because text is laid out again when a figure is
+    # written.
     with apply_settings(_STYLE):
         figures = {name: _FIGURE_FUNCTIONS[name](report) for name in list_figure_names(report)}
         rendered = {}
@@ -125,6 +131,7 @@ def get_extreme_pose(report: DiagnosisReportData, view: RunView) -> dict[str, fl
         quantity, _, joint = channel.name.partition(".")
         values = view.get_samples("observed", channel_index)
         recorded_values = values[np.isfinite(values)]
+        # Channels named q.JOINT are joint positions.
         if quantity == "q" and recorded_values.size:
             # A missing sample counts as no motion.
             positions[joint] = np.nan_to_num(values, nan=float(recorded_values[0]))

@@ -156,6 +156,7 @@ def build_residual_profile_table(report: DiagnosisReportData) -> Table:
         if report.has_extended_model:
             means_by_model["after"] = profile.after
         for model, means in means_by_model.items():
+            # The standard error follows from the noise, so it is that of both models.
             for centre, mean, error in zip(profile.centres, means, profile.error, strict=True):
                 values = {"mean": mean, "low": mean - 2 * error, "high": mean + 2 * error}
                 rows.append({**profile_columns, "when": model, "at": centre, **values})
@@ -186,7 +187,8 @@ def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
         "before": BASE_MODEL_STYLE._replace(marker="s"),
     }
     models = ("after", "before") if report.has_extended_model else ("before",)
-    # Profiles contain arrays, which cannot be compared, so they are recognised by their identity.
+    # Informative profiles come first (False sorts before True). Profiles contain arrays, which
+    # cannot be compared, so they are recognised by their identity.
     shown_ids = {id(profile) for profile in select_informative_profiles(report.profiles)}
     panels = []
     for profile in sorted(report.profiles, key=lambda profile: id(profile) not in shown_ids):

@@ -96,8 +96,9 @@ def build_identifiability_section(report: DiagnosisReportData) -> dict[str, Any]
         - ``legend``: signs of all causes.
         - ``counts``: number of causes by level, diagnosed ones being identifiable.
         - ``found``: diagnosed causes.
-        - ``matrices``, ``clear_matrices``: effects at places that are not, and that are,
+        - ``matrices``: effects with places (such as joints), by places; those that are not
           identifiable at every place.
+        - ``clear_matrices``: the same for effects that are identifiable at every place.
         - ``families``, ``family_headings``: names of the effects without a place, by family and
           status.
     """
@@ -135,9 +136,14 @@ def _list_supported_causes(report: DiagnosisReportData) -> list[Cause]:
 def _list_cause_rows(report: DiagnosisReportData, found: Sequence[Cause]) -> list[CauseRow]:
     """List the possible causes in the order of the registry, each with its status.
 
-    The status of a diagnosed cause is ``found``; that of a cause with alternatives, and of the
-    alternatives, is ``set``. They are marked at every place where they act. The status of other
-    causes is their identifiability.
+    There are three kinds of status:
+
+    * ``found``: a diagnosed cause without alternatives.
+    * ``set``: a diagnosed cause with alternatives that the data cannot distinguish from it, and
+      these alternatives.
+    * The identifiability of any other cause, such as ``weak``.
+
+    A diagnosed cause at several places has its status at each of them.
 
     Args:
         report: data of the report.
@@ -181,7 +187,7 @@ def _build_matrices(placed: Sequence[CauseRow], effects: set[str]) -> list[dict[
         kind = get_place_kind(row.effect)
         if row.effect_name in effects:
             matrix = matrices.setdefault(kind, {"kind": kind, "places": {}, "effects": {}})
-            # The keys are an ordered set.
+            # The keys are an ordered set of places; the values mean nothing.
             matrix["places"][row.place] = True
             by_place = matrix["effects"].setdefault(row.effect_name, {})
             known_row = by_place.get(row.place, row)
@@ -236,7 +242,7 @@ def format_identifiability(assessments: Sequence[ParameterIdentifiability]) -> l
     }
     counts = [f"{len(members)} {level}" for level, members in causes.items()]
     lines.append(f"causes, each considered alone, smallest uncertainty first: {', '.join(counts)}")
-    # A limit has no interval, and follows the causes that have one.
+    # A limit or backlash has no interval (NaN), and follows the causes that have one.
     identifiable = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
     lines += [f"  {_format_parameter(number)}" for number in identifiable[:MAX_LISTED_CAUSES]]
     # The other causes are named only.
@@ -280,7 +286,11 @@ def _format_parameter(number: ParameterIdentifiability) -> str:
 def _count_effects(assessments: Sequence[ParameterIdentifiability]) -> list[str]:
     """List the effects of causes once each, with the number of their places if there are several.
 
-    The name of a cause is that of its effect with its place, and of its coefficient after a space.
+    The name of a cause is that of its effect with its place, and of its coefficient after a space:
+    ``mass.offset@forearm x``.
+
+    Args:
+        assessments: identifiability of the coefficients of causes.
     """
     places: dict[str, set[str]] = {}
     for number in assessments:

@@ -111,6 +111,7 @@ def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
             sensors.append(JointRow(channel.name, channel_index, channels))
     rows = []
     for name, channels in joints.items():
+        # `QUANTITY_LABELS` has position, velocity and torque in this order.
         motion_channel = next(channels[q] for q in QUANTITY_LABELS if q in channels)
         rows.append(JointRow(name, motion_channel, channels))
     return rows + sensors
@@ -144,7 +145,8 @@ def draw_run_figure(report: DiagnosisReportData) -> Figure:
     row_height = _ROW_HEIGHTS.get(len(rows), _MIN_ROW_HEIGHT)
     named_joints = {mark.name for mark in list_place_marks(report)} | list_marked_joints(report)
     names = [_format_row_name(row, row.name in named_joints) for row in rows]
-    # Widths in inches: names, panels of motion and legend, and each panel of residuals.
+    # Widths in inches: names, the panel of motion (5.15), and each panel of residuals (2.6), with
+    # their margins.
     names_width = max(1.95, 0.12 + measure_text_width(names, _NAME_SIZE, "bold") + _NAME_GAP_INCHES)
     width = names_width + 5.15 + 2.6 * len(quantities)
     height = _TOP_MARGIN_INCHES + _BOTTOM_MARGIN_INCHES + row_height * len(rows)
@@ -217,7 +219,7 @@ def _draw_motion(
         panel: axes to draw on.
         report: content of the report.
         view: run to show: its part of the data, and its index there.
-        row: the joint.
+        row: the joint or sensor, with the index of the channel that shows its motion.
         is_named: whether the diagnosis names the joint; its name is then highlighted.
     """
     channel = report.channels[row.motion_channel]
@@ -378,10 +380,11 @@ def _add_title_and_legend(
     figure.suptitle(title, fontsize=11, x=0.012, ha="left", y=1 - 0.2 / height, va="center")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     with warnings.catch_warnings():
-        # A residual column may have no panel in its first row.
+        # The first row may have no panel in this column, so the legends of all rows are read;
+        # Matplotlib warns of a panel without entries.
         warnings.simplefilter("ignore", UserWarning)
         residual_legends = [panel.get_legend_handles_labels() for panel in axes[:, 1]]
-    # The band of the noise is the only entry, and the same in all rows.
+    # The band of the noise is the only entry, and the same in all rows: the first one is used.
     band_handles, band_labels = next(
         (legend for legend in residual_legends if any(legend)), ([], [])
     )

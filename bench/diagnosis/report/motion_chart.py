@@ -77,6 +77,10 @@ def build_motion_table(report: DiagnosisReportData) -> MotionTable:
 
     Args:
         report: content of the report, with the measured and simulated runs.
+
+    Returns:
+        The table with its runs, the number of parts of a run (0 if all samples are shown), the
+        samples of the longest run, and the number of runs that are left out.
     """
     runs = rank_runs(report)
     channel_count = len(report.channels)
@@ -87,6 +91,7 @@ def build_motion_table(report: DiagnosisReportData) -> MotionTable:
         for channel_index in range(channel_count):
             for name, cells in _format_rows(report, run, channel_index, samples_per_run).items():
                 columns.setdefault(name, []).extend(cells)
+    # No run is divided into parts if all its samples are shown: then the number of parts is 0.
     longest_run = max(len(run.times) for run in shown_runs)
     part_count = _count_parts(report, samples_per_run) if longest_run > samples_per_run else 0
     return MotionTable(
@@ -210,6 +215,7 @@ def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
     panels: list[Panel] = []
     for run in table.runs:
         for facets, channel_index in places:
+            # Facets are the values of the switches by which readers show a panel.
             all_facets = {"run": _format_run_title(report, run), **facets}
             panels += _make_panels(report, run, channel_index, all_facets, is_wide)
     toggles = ("joint", "quantity") if is_robot(report) else ("channel",)
@@ -241,6 +247,7 @@ def _list_switches(report: DiagnosisReportData) -> list[tuple[dict[str, str], in
     for row in list_joint_rows(report):
         for quantity, channel_index in row.channels.items():
             prefix, _, _ = report.channels[channel_index].name.partition(".")
+            # The name of a sensor does not begin with a quantity.
             label = QUANTITY_LABELS[quantity] if prefix in QUANTITY_LABELS else "sensor"
             facets = {"joint": sanitise(row.name, 40), "quantity": label}
             places.append((facets, channel_index))
@@ -273,6 +280,7 @@ def _list_hidden(
         gaps_by_name.setdefault(facets[toggle], []).append(gap)
     remaining = MAX_INITIAL_CHANNELS
     visible_names: set[str] = set()
+    # A joint whose channels exceed the remaining number is skipped; a smaller one may still fit.
     for name in sorted(gaps_by_name, key=lambda name: max(gaps_by_name[name]), reverse=True):
         channel_count = len(gaps_by_name[name])
         if not visible_names or channel_count <= remaining:

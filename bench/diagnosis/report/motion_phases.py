@@ -39,7 +39,8 @@ def detect_phases(evaluator: RunEvaluator, simulated: Array) -> dict[str, Mask]:
         return {}
     # The lower limit avoids a division by zero if nothing moves; then all is at rest.
     largest = max(float(np.nanmax(speed)), 1e-300)
-    # A reversal is slow for a moment too, so only a lasting state counts as rest.
+    # The speed is also small for a moment where the motion reverses, so only a lasting state counts
+    # as rest.
     is_at_rest = _find_lasting_stretches(speed < REST_SPEED_SHARE * largest)
     if system.bounces:
         impact = _find_impacts(evaluator, simulated) & ~is_at_rest
@@ -97,7 +98,11 @@ def compute_slopes(evaluator: RunEvaluator, simulated: Array, channel: str) -> A
 
 
 def _find_lasting_stretches(mask: Mask) -> Mask:
-    """Return where a mask is true for at least `MIN_CONSECUTIVE_SAMPLES` consecutive samples."""
+    """Return where a mask is true for at least `MIN_CONSECUTIVE_SAMPLES` consecutive samples.
+
+    Args:
+        mask: (R, T) mask of the T samples of R runs.
+    """
     lasting = np.zeros_like(mask)
     for row, lasting_row in zip(mask, lasting, strict=True):
         # With zeros at both ends, changes come in pairs: start and end of each interval.
@@ -131,6 +136,7 @@ def _find_impacts(evaluator: RunEvaluator, simulated: Array) -> Mask:
         # In a flat interval only the last sample counts, so that one impact is not counted twice.
         is_lowest = (heights <= previous_heights) & (heights < next_heights)
     is_lowest = np.pad(is_lowest, ((0, 0), (1, 1)))
+    # Each lowest sample marks its neighbours on either side, too.
     for shift in range(-IMPACT_MARGIN_SAMPLES, IMPACT_MARGIN_SAMPLES + 1):
         mask |= np.roll(is_lowest, shift, axis=1)
     return mask

@@ -145,6 +145,7 @@ def compute_residual_profiles(
         after: (R, T, C) simulated by the extended model.
         sigma: (C,) noise of each channel.
     """
+    # Name of the channel on which sensor effects act.
     name = evaluator.simulator.system.reading(evaluator.channels)
     variables = _iterate_variables(evaluator, after)
     if get_robot(evaluator) is not None:
@@ -156,6 +157,7 @@ def compute_residual_profiles(
         is_finite = np.isfinite(evaluator.observed[:, :, channel_index]) & np.isfinite(values)
         variable_values = values[is_finite]
         edges = _compute_bin_edges(variable_values)
+        # The variable does not change.
         if edges is None:
             continue
         # Values outside the edges count in the outermost bins.
@@ -206,7 +208,16 @@ def _find_largest_residual_channel(evaluator: RunEvaluator, before: Array, sigma
 
 
 def _compute_bin_edges(values: Array) -> Array | None:
-    """Return bin edges (BINS + 1,) over most of the values; None if they are all equal."""
+    """Return the edges of equal bins over most of the values; None if they are all equal.
+
+    The share `PROFILE_TAIL_SHARE` of the values is outside the edges at either end.
+
+    Args:
+        values: (N,) values of the variable.
+
+    Returns:
+        (`PROFILE_BIN_COUNT` + 1,) edges in ascending order.
+    """
     if not values.size or np.ptp(values) == 0:
         return None
     low, high = (

@@ -87,7 +87,8 @@ def draw_residual_figure(report: DiagnosisReportData) -> Figure:
     names = place_names(locations)
     left_margin = max(_MIN_NAMES_WIDTH, 0.25 + measure_text_width(names, FONT_SIZE))
     profiles_from = left_margin + _PROFILES_AFTER
-    # Panel of the gaps, and columns of profiles; a single column is wider than one of several.
+    # In inches: names, panel of the gaps (3.3) and columns of profiles. A single column is wider
+    # than one of several.
     width = left_margin + 3.3 + (4.4 if columns == 1 else 3.1 * columns)
     # Height of a row, and of each further line of a name.
     row_height = 0.27 + 0.13 * (count_max_lines(names) - 1)

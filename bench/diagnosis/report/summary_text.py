@@ -93,10 +93,13 @@ def _write_one(macro: str, *values: Any) -> str:
 
 
 def format_summary(report: DiagnosisReportData) -> list[str]:
-    """Format the summary as terminal lines.
+    """Format the summary of a report as lines for the terminal.
 
     They contain the verdict in a sentence, the gain, the location of the gap, changed parameters,
     and what remains unexplained.
+
+    Args:
+        report: content of the report.
     """
     # The title comes from a file: it must not contain line breaks or terminal control sequences.
     lines = [sanitise(report.title, TERMINAL_WIDTH), ""]
@@ -176,6 +179,9 @@ def list_largest_gaps(report: DiagnosisReportData) -> list[GapLocation]:
     """List the run, the channel and the phase with the largest gap, if there are several of each.
 
     The gap is the RMS residual in units of the noise.
+
+    Args:
+        report: content of the report, with the gap of each run, channel and phase of the motion.
     """
     largest = []
     for kind in ("run", "channel", "phase"):
@@ -224,6 +230,9 @@ def get_held_out_unit(report: DiagnosisReportData) -> str:
     It is the stored unit. For a result without one, it is found by comparison: the noise floor is
     the RMS noise of all channels with one unit. If this fits no unit, the result is the only unit
     of the channels, or ``1``.
+
+    Args:
+        report: content of the report, with the channels and their noise.
     """
     held_out = report.verdict.heldout
     if held_out is not None and held_out.unit:
@@ -339,7 +348,11 @@ def list_verdict_reasons(finding: DiagnosisResult) -> Iterator[str]:
 
 
 def _describe_residual_structure(lack_of_fit: LackOfFitResult) -> str:
-    """Say how the residual of the final model still differs from the noise of the sensors."""
+    """Say how the residual of the final model still differs from the noise of the sensors.
+
+    Args:
+        lack_of_fit: Result of the lack-of-fit test, with a p-value for a pattern in the residual.
+    """
     p_value = lack_of_fit.p_value
     # Lack of fit is either a residual with a pattern, or one that is only too large.
     if p_value < STRUCTURE_P_VALUE_THRESHOLD:
@@ -378,7 +391,7 @@ def list_bound_warnings(changes: Sequence[ParameterChange]) -> Iterator[str]:
                 "cause may compensate for a value beyond the bound. Check the "
                 "units and constants of the recording"
             )
-            # The second fit is not reported in addition.
+            # A parameter that is at a bound in the base fit is not reported for the second fit.
             break
 
 
@@ -399,7 +412,7 @@ def list_unexplained_residuals(
     for channel in lack_of_fit.channels_above_noise:
         noise_multiple = lack_of_fit.excess[channels.index(channel)]
         yield f"the residual of channel {channel} is {noise_multiple:.3g} times its noise"
-    # Without a result of the test for unmodelled forces there is no dependence to report.
+    # `where` names the variable; it is empty if no test for unmodelled forces was made.
     if lack_of_fit.has_structure and lack_of_fit.where:
         yield f"the residual behaves like a force that depends on {lack_of_fit.where}"
     if insensitive:

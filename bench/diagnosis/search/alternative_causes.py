@@ -83,8 +83,9 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
     competing_models = list_competing_models(search, model)
     if noise is None:
         competing_models = select_decisive(search, model, competing_models)
-    # The result is the best of the compared models. With structure in the residual, likelihoods
-    # only tell which model mimics it best, so no competing model replaces the model.
+    # The result is the best of the compared models, each refitted in step 4. With structure in the
+    # residual, likelihoods only tell which model mimics it best, so no competing model replaces the
+    # model.
     compared_models = [model]
     if noise is not None:
         compared_models = [
@@ -93,7 +94,8 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
             if abs(model.penalised_log_likelihood - candidate.penalised_log_likelihood)
             < MAX_COMPETITOR_DISTANCE
         ] or [model]
-    # 4. Refits.
+    # 4. Refits, from the own parameters of each model. Models that differ from the best one in one
+    # effect are also fitted from the parameters of the best one.
     starts = [candidate.fit.make_start() for candidate in competing_models]
     starts += [candidate.fit.make_start() for candidate in submodels]
     starts += [
@@ -125,6 +127,7 @@ def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
     size = len(model.effects)
     known_effect_sets = set(search.models)
     submodels = [search.remove_effect(model, name) for name in model.effects]
+    # Each model without one effect is extended by the others; the fits are stored in `models`.
     # The second argument is the maximum number of candidates.
     search.refit_extensions(submodels, len(search.evaluator.library))
     best = model
@@ -278,6 +281,10 @@ class AlternativeFinder:
         alternative is an effect that, in place of this one, explains the data equally well. Of
         these and the effect itself, the one with the most plausible coefficients is preferred,
         unless the residual has structure.
+
+        Args:
+            model: fitted model with the effect.
+            effect: name of the effect, with its place on a robot: ``drag.linear@elbow``.
         """
         reduced_model = self._get_model_without(model, effect)
         gain = model.likelihood.value - reduced_model.likelihood.value
@@ -306,6 +313,10 @@ class AlternativeFinder:
         """Return the model without the effect, against which the gain of the effect is measured.
 
         If no simulations are allowed and this model was not fitted, return the base model.
+
+        Args:
+            model: fitted model with the effect.
+            effect: name of the effect that is removed.
         """
         if self.simulates:
             return self.search.remove_effect(model, effect)
@@ -355,6 +366,10 @@ class AlternativeFinder:
         is tested by the fitted models in which it replaces the effect and everything else is equal.
         The distance is how far such a model is behind, in twice the log-likelihood; the effect
         itself has the distance 0.
+
+        Args:
+            model: fitted model with the effect.
+            effect: name of the effect that another one may replace.
         """
         shared = set(model.effects) - {effect}
         competing_effects = [_Competitor(0.0, effect)]

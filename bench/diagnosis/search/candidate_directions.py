@@ -132,7 +132,8 @@ def compute_directions(
     responses = _compute_directions(evaluator, fit, probes)
     is_acting = _find_observable_probes(evaluator, probes, responses)
     # 2. Modifiers.
-    # The first responses show which coefficients change nothing alone.
+    # The first responses show which coefficients change nothing alone. These are discarded below,
+    # and appear only together with an acting coefficient.
     modifier_probes = list(_make_modifier_probes(evaluator, probes, is_acting))
     # 3. Responses that change something.
     active_indices = np.flatnonzero(is_acting)
@@ -254,8 +255,8 @@ def _list_shapes(
     parameters = list_coefficients(evaluator, name)
     coefficients = evaluator.available_effects[name].coefficients
     travel = evaluator.get_effect_travel(name)
-    # The inertia of a rotor that the model has as an effect already is taken over from it, so only
-    # the smallest value is tried.
+    # "rotor" is the share of a joint's inertia that its rotor has. If the model has this inertia as
+    # an effect already, it is taken over from there, so only the smallest value is tried.
     grids = [
         parameters[i].bounds[:1]
         if coefficients[i].of == "rotor" and _is_contained_in_model(evaluator, model_effects, name)
@@ -439,9 +440,10 @@ def _make_limit_probes(
     # A limit of a quantity that is always zero has no effect.
     if not largest.any():
         return
-    # Fractions by the kind of quantity that is limited (`Coefficient.of`); all other kinds are
-    # levels of an input. The error of a servo peaks briefly after a jump, as the rate of a command
-    # does.
+    # Fractions by the kind of quantity that is limited (`Coefficient.of`): the rate and the
+    # acceleration of an input, the error of a servo, the travel of a joint (backlash), and a
+    # compliance ("give"). All other kinds are levels of an input. The error of a servo peaks
+    # briefly after a jump, as the rate of a command does.
     shares_by_kind = {
         "input/s": RATE_LIMIT_SHARES,
         "input/s^2": ACCELERATION_LIMIT_SHARES,
@@ -576,7 +578,8 @@ def _make_modifier_probes(
         probes: K single coefficients whose responses were computed.
         acting: (K,) mask of the coefficients that change the runs.
     """
-    # By name of the effect: its first acting coefficient, and its idle ones.
+    # By name of the effect: its first acting coefficient, and its idle ones, which change nothing
+    # alone.
     acting_probes: dict[str, CandidateDirection] = {}
     idle_probes: dict[str, list[CandidateDirection]] = {}
     for probe, acts in zip(probes, acting, strict=True):
@@ -651,6 +654,7 @@ def _compute_directions(
     # A probe that the simulator cannot follow gets a direction of zeros.
     if not is_finite.all():
         values[~is_finite] = 0.0
+    # A probe that is valid at one size only has the size 1.
     values /= _compute_probe_sizes(probes)[:, None, None, None]  # (1)
     return values
 
@@ -714,7 +718,8 @@ def compute_effect_responses(
     for run, (values, simulation_count) in evaluator.worker_pool.map_unordered(
         evaluator, _compute_responses_of_run, worker_arguments
     ):
-        # Values that overflow single precision become infinite here.
+        # Values that overflow single precision become infinite here. A run may be shorter than the
+        # longest one; its further samples stay NaN.
         with np.errstate(over="ignore"):
             responses[missing_indices, run, : values.shape[1]] = values
         evaluator.simulation_count += simulation_count

@@ -35,7 +35,7 @@ from bench.diagnosis.kalman.cubature_filter import (
     set_first_states_in_contact,
     smooth_first_states,
 )
-from bench.diagnosis.search.candidate_directions import iterate_first_probes
+from bench.diagnosis.search.candidate_directions import DirectionSet, iterate_first_probes
 from bench.diagnosis.search.effect_search import (
     MAX_P_VALUE_FURTHER_EFFECT,
     MAX_REFITTED_CANDIDATES,
@@ -151,6 +151,7 @@ def _search_states_of_base(search: EffectSearch) -> None:
     if not search.compute_excess_residual(base) < MAX_EXCESS_OF_WRONG_STATES:
         return
     evaluator = search.evaluator
+    # The initial states, and the standard deviations of their errors.
     states_before, deviations_before = evaluator.initial_state_guesses, evaluator.state_prior
     # With contacts, initial states have been smoothed, which gives their standard deviations.
     assert deviations_before is not None
@@ -201,7 +202,7 @@ def _fit_single_effects(search: EffectSearch) -> FittedModel | None:
             fits.append(_fit_about_its_first_states(search, start))
             if _is_explained(search, fits[-1]):
                 break
-    # 3. The best fit.
+    # 3. The best fit, with the lowest sum of squares (cost).
     best = min(fits, key=lambda model: model.fit.cost, default=base)
     if best.fit.cost < MAX_COST_RATIO * base.fit.cost:
         return best
@@ -237,6 +238,7 @@ def _list_single_effect_starts(search: EffectSearch) -> list[FitStart]:
     exclude_laws_with_many_shapes(search)
     search.refit_extensions([base], MAX_REFITTED_CANDIDATES)
     for model in search.models.values():
+        # All models but the base model have one effect here.
         if model.effects:
             coefficient_count = len(evaluator.get_coefficient_indices(model.effects[0]))
             ranked_starts.append((coefficient_count * model.fit.cost, model.fit.make_start()))
@@ -321,6 +323,8 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
             return search.fit_one(start)
         # 2. Scan.
         if is_at_contact:
+            # An effect at a contact has one coefficient. It was not simulated yet, so that its sum
+            # of squares is infinite.
             value = _ScannedValue(
                 name,
                 coefficient=float(theta[indices[0]]),
@@ -338,7 +342,8 @@ def _fit_about_its_first_states(search: EffectSearch, start: FitStart) -> Fitted
             best_sample.states, FIRST_STATE_MARGIN * compute_first_deviations(smoothed)
         )
         # 4. Levenberg-Marquardt.
-        # Sums of squares about other initial states are not comparable.
+        # The fit of the last round is removed, since sums of squares about other initial states are
+        # not comparable.
         search.models.pop(frozenset(start.effects), None)
         model = search.fit_one(FitStart(start.effects, best_sample.theta, best_sample.states))
         if _is_explained(search, model) or not model.fit.cost < limit:
@@ -382,6 +387,7 @@ def _use_first_states_of(
     # With contacts, initial states have been smoothed, which gives their standard deviations.
     assert deviations is not None
     evaluator.begin_at(model.fit.initial_states, deviations)
+    # Fits about other initial states are not comparable.
     search.models.clear()
     # A start without effects is that of the base model.
     search.refit_models([FitStart((), base.fit.theta, evaluator.initial_state_guesses)])
@@ -395,7 +401,9 @@ def _use_first_states_of(
 def _search_first_states(search: EffectSearch, runs: RunEvaluator, theta: Array) -> None:
     """Search initial states at random if the smoothed ones do not explain the runs.
 
-    They replace those of the runs only if the sum of squares decreases.
+    Smoothed states are those that a Kalman smoother estimates from all samples of a run. The new
+    states replace those of the runs only if the sum of squares decreases. Nothing happens if a
+    filter cannot follow the runs.
 
     Shapes: P parameters.
 
@@ -435,7 +443,8 @@ def _compute_squares(evaluator: RunEvaluator, sigma: Array, samples: Array, stat
         states: (R, s) initial states.
     """
     run_count, sample_count = len(states), len(samples)
-    # Every run is simulated with every set of parameters, in one batch.
+    # Every run is simulated with every set of parameters, in one batch: all runs with the first
+    # set, then all runs with the second, and so on.
     simulated = evaluator.simulate(
         np.repeat(samples, run_count, axis=0),
         np.tile(np.arange(run_count), sample_count),
@@ -718,10 +727,11 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     1. Compute the change by the present effect.
     2. Score all other effects against the sum, about the model without the effect.
     3. Select those that leave almost as small a residual as the present effect does.
-    4. Fit them from their best coefficients.
+    4. Fit them from their best coefficients. The fits are stored in `search.models`.
 
     Args:
-        search: the search, with scores about the model.
+        search: the search, with the stored scan of the model: the responses of the runs to the
+            effects that it lacks (directions), and their scores.
         model: fitted model with one effect.
     """
     (name,) = model.effects
@@ -729,28 +739,16 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     model = search.refine_jacobian(model)
     scan = search.cached_scans[frozenset(model.effects)]
     residual = search.compute_residual(model.fit)
-    # 1. Change by the present effect.
-    columns = _find_columns(search, model)
+    # 1. Change by the present effect: (R, T, C), as the residual.
     change = _compute_change(search, model)
+    # The residual e + c d of the model without the effect, to first order.
+    combined_residual = residual + change
     # 2. Scores.
-    # A test about the model itself would project out the change, because the fit has derivatives by
-    # the coefficients of the effect. So these columns are removed.
-    fit_without_effect = replace(
-        model.fit,
-        effects=(),
-        free_indices=np.delete(model.fit.free_indices, columns),
-        jacobian=np.delete(model.fit.jacobian, columns, axis=3),
-    )
-    test = ScoreTest(
-        fit_without_effect,
-        scan.directions,
-        search.observed_mask,
-        search.compute_channel_weights(model),
-    )
-    scores = test.compute_scores(residual + change)
+    test = _make_test_without_effect(search, model, scan.directions)
+    scores = test.compute_scores(combined_residual)
     # 3. Selection.
     # Parameters and initial states absorb a part of the change, as they would in a fit.
-    (residual_without_effect,) = test.project_out((residual + change)[None])
+    (residual_without_effect,) = test.project_out(combined_residual[None])
     squares_without, squares_with = (
         float(np.square(values / search.noise.sigma).sum())
         for values in (residual_without_effect, residual)
@@ -765,21 +763,51 @@ def _fit_competing_effects(search: EffectSearch, model: FittedModel) -> None:
     if not competitors.effects:
         return
     # 4. Fits.
-    # They start from the parameters of the model, with its effect off.
+    # They extend a model without effects that has the other parameters and the initial states of
+    # the given model.
     theta = model.fit.theta.copy()
     theta[search.evaluator.coefficient_slices[name]] = 0.0
     base = search.base_model
-    fit = replace(base.fit, theta=theta, initial_states=model.fit.initial_states)
+    fit_without_effect = replace(base.fit, theta=theta, initial_states=model.fit.initial_states)
     starts = select_refit_starts(
         search.evaluator,
         search.noise,
-        replace(base, fit=fit),
+        replace(base, fit=fit_without_effect),
         scan.directions,
         competitors,
         MAX_COMPETITORS,
         fits_all=False,
     )
     search.refit_models(starts, is_racing=False)
+
+
+def _make_test_without_effect(
+    search: EffectSearch, model: FittedModel, directions: DirectionSet
+) -> ScoreTest:
+    """Make a score test about the model without its only effect.
+
+    A test projects out what the fitted parameters can explain. About the model itself, it would
+    project out the change by the effect, whose coefficients are fitted. So the derivatives by these
+    coefficients are removed.
+
+    Args:
+        search: the search, with the runs and the noise.
+        model: fitted model with one effect.
+        directions: responses of the runs to the candidate effects.
+    """
+    columns = _find_columns(search, model)
+    fit_without_effect = replace(
+        model.fit,
+        effects=(),
+        free_indices=np.delete(model.fit.free_indices, columns),
+        jacobian=np.delete(model.fit.jacobian, columns, axis=3),
+    )
+    return ScoreTest(
+        fit_without_effect,
+        directions,
+        search.observed_mask,
+        search.compute_channel_weights(model),
+    )
 
 
 def _select_smallest_residuals(

@@ -148,7 +148,8 @@ class Diagnosis:
         self._search_control.begin_question("rivals")
         self._model = search.simplify_laws(refine_best_model(search, self._model))
         self._model = search.fit_to_convergence(self._model)
-        validated_effects = self._model.effects
+        # Effects of the model that was fitted to convergence.
+        converged_effects = self._model.effects
         # 4. Held-out runs.
         self._evaluate_on_held_out_runs()
         # 5. Structure.
@@ -164,7 +165,7 @@ class Diagnosis:
         )
         validation = self._held_out_validation
         # Steps 4 to 6 may have changed the effects since the fit to convergence.
-        if model.effects != validated_effects:
+        if model.effects != converged_effects:
             model = search.fit_to_convergence(model)
             if validation is not None:
                 validation.evaluate_models([model])
@@ -261,7 +262,8 @@ class Diagnosis:
         a part of the time limit was reserved.
         """
         search = self._search
-        # It lists the questions of the diagnosis that stay open.
+        # It lists the questions of the diagnosis that stay open; one of them is validation, if
+        # there are held-out runs.
         early_stop = self._search_control.make_early_stop(self._held_out is not None)
         model = self._model or search.get_best_so_far()
         # If the validation is stopped, too, the verdict does without it.
@@ -271,8 +273,8 @@ class Diagnosis:
                 validation.evaluate_models([search.base_model, model])
                 self._search_control.check_not_stopped()
                 self._held_out_validation = validation
-        # The residual was not tested, so the verdict counts it as structure and not as noise. The
-        # report shows only its size.
+        # The residual was not tested, so the verdict counts it as structure and not as noise
+        # (p-value 0). The report shows only its size (p-value 1).
         lack_of_fit = replace(assess_residual_size(search, model), p_value=0.0)
         finder = self.alternative_finder(
             search, self._held_out_validation, structure=False, simulates=False

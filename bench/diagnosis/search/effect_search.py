@@ -150,12 +150,17 @@ class EffectSearch(ScoredModelSet):
     def correct_step_errors(self, model: FittedModel) -> FittedModel:
         """Correct the discretisation error about a model, and refit its close competing models.
 
-        A coarse time step of a robot's simulator causes an error that an effect may imitate. After
-        the correction, another model may be better, possibly a simpler one; it is returned. The
+        Competing models have as many effects, and about the same penalised log-likelihood. A coarse
+        time step of a robot's simulator causes an error that an effect may imitate. After the
+        correction, another model may be better, possibly with a simpler effect; it is returned. The
         correction is undone if the best of these models is likelier without it.
 
+        Args:
+            model: the fitted model.
+
         Returns:
-            The best model of the same size after the correction, which may be a simpler one.
+            The best model with as many effects after the correction; the given one for systems that
+            are not robots, or if the correction was last made about the same effects.
         """
         key = frozenset(model.effects)
         # Only robots are corrected, and not twice in succession about the same effects.
@@ -179,6 +184,7 @@ class EffectSearch(ScoredModelSet):
             > model.penalised_log_likelihood - STEP_CORRECTION_REFIT_DISTANCE
         ]
         self.refit_models([m.fit.make_start() for m in close_models], is_racing=False)
+        # The models are in descending order of their penalised log-likelihood.
         best = select_by_size(self, effect_count)[0]
         # A refit replaces a model only if it is likelier. If the best model is one from before, no
         # corrected model is likelier.
@@ -189,8 +195,10 @@ class EffectSearch(ScoredModelSet):
     def get_best_so_far(self) -> FittedModel:
         """Return the best supported model of a search that has to end now, without any simulation.
 
-        The best larger fitted model replaces the present one if its penalised log-likelihood is
-        higher and its gain is significant by the known scores.
+        A model is supported if the search found its gain over the smaller models significant. The
+        base model, which has no effects, always is. The best larger fitted model replaces the
+        present one if its penalised log-likelihood is higher and its gain is significant by the
+        known scores.
         """
         # The latest fit of these effects.
         best = self.models[frozenset((self.best_supported_model or self.base_model).effects)]
@@ -241,7 +249,11 @@ class EffectSearch(ScoredModelSet):
         First only the best smaller model is extended. If that does not explain the data, further
         and slower methods follow: fits to short segments; then, for single effects, fits of all
         candidates, and for more effects, extensions of the other good models (the beam).
+
+        Args:
+            size: number of effects of the models.
         """
+        # The best smaller models, the likeliest first.
         smaller_models = select_beam(self, size - 1)
         self.refit_extensions(smaller_models[:1], MAX_REFITTED_CANDIDATES)
         # Each further method needs more simulations, so it is skipped if the data are explained.
@@ -265,6 +277,9 @@ class EffectSearch(ScoredModelSet):
         Its residual must be noise, and no effect that it lacks may have a significant score. Scores
         cost many simulations, and are computed only if the residual is noise. It is False if no
         model of this size was fitted.
+
+        Args:
+            size: number of effects of the models.
         """
         model = self.get_best(size)
         if model is None:
@@ -291,12 +306,17 @@ class EffectSearch(ScoredModelSet):
         """Search on short segments of the runs, and refit the best models to whole runs.
 
         Each segment has its own initial state, so errors accumulate less and fits have fewer local
-        minima (multiple shooting). Models of `size` effects are searched. The search is skipped if
-        segments are no easier to fit than whole runs.
+        minima (multiple shooting). The refitted models are stored in `models`. The search is
+        skipped if segments are no easier to fit than whole runs, and for more than
+        `MAX_EFFECTS_ON_SEGMENTS` effects.
+
+        Args:
+            size: number of effects of the models that are searched.
         """
         if size > MAX_EFFECTS_ON_SEGMENTS or self._forgets_initial_state:
             return
         segment_evaluator = make_segment_evaluator(self.evaluator)
+        # The runs cannot be split.
         if segment_evaluator is None:
             return
         # One search on segments serves every size, beginning with the base model; it decides
@@ -407,7 +427,10 @@ class EffectSearch(ScoredModelSet):
         """Return the model without effects that it does not need.
 
         An effect is not needed if the model without it has at least the same penalised
-        log-likelihood. Effects are dropped one at a time.
+        log-likelihood. Effects are dropped one at a time, and the remaining model is tested again.
+
+        Args:
+            model: the fitted model.
         """
         key = frozenset(model.effects)
         # Smaller models are fitted again from this one, even if they are known: they may reach a
@@ -428,6 +451,9 @@ class EffectSearch(ScoredModelSet):
         effect at several joints or bodies) by its most active member. The simpler model must have
         at least the same penalised log-likelihood, or nearly the same excess residual (RMS residual
         in units of the noise, minus one). It is then simplified further.
+
+        Args:
+            model: the fitted model; it is returned if no simpler model is as good.
         """
         for name in model.effects:
             # The simpler effects that replace the effect together, usually a single one.
@@ -521,6 +547,7 @@ class EffectSearch(ScoredModelSet):
         if len(members) < 2 or len(indices) != count_per_member * len(members):
             return
         coefficients = model.fit.theta[indices].reshape(len(members), count_per_member)  # (M, k)
+        # Columns of the Jacobian that belong to these coefficients.
         free_indices = model.fit.free_indices.tolist()
         columns = [free_indices.index(index) for index in indices]
         # Change of all samples per unit of each coefficient (root of the sum of squares).
@@ -566,6 +593,12 @@ class EffectSearch(ScoredModelSet):
 
         Each effect in turn is removed, and the smaller model is extended by the most promising
         effects. The best model of the size then loses effects that it does not need.
+
+        Args:
+            model: the fitted model.
+
+        Returns:
+            The improved model; the given one if no exchange improves it.
         """
         for _ in range(MAX_SWAP_ROUNDS):
             # Each smaller model is extended again, because the removed effect may not be the best.

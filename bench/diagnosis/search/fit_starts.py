@@ -271,7 +271,7 @@ def _predict_jacobian(
         if not direction_set.candidates[column].is_single_size
     }
     coefficient_indices = evaluator.get_coefficient_indices(name)
-    # Only the range of a shape coefficient does not contain zero.
+    # Only the range of a shape coefficient does not contain zero; its lower bound is positive.
     has_shape = any(evaluator.parameters[index].bounds[0] > 0 for index in coefficient_indices)
     if not column_by_coefficient or has_shape:
         return None
@@ -337,6 +337,7 @@ def _list_start_coefficients(
         return
     index = evaluator.coefficient_slices[name].start + first_probe.coefficient_index
     _, upper_bound = evaluator.parameters[index].bounds
+    # Shares of the upper end of the plausible range, of either sign if the sign is free.
     shares = list(RANGE_SHARES)
     if first_probe.can_be_negative:
         shares += [-share for share in RANGE_SHARES]
@@ -374,6 +375,7 @@ def _select_nearest_start(
     run_indices = np.tile(np.arange(run_count), start_count)
     # All starts are simulated in one engine call, as one batch.
     predictions = evaluator.simulate(theta, run_indices, states, run_share)
+    # One element (R, T, C) for each start.
     predictions = predictions.reshape(start_count, run_count, *predictions.shape[1:])
     sample_mask = evaluator.get_sample_mask(run_share)
     lowest_costs: dict[tuple[int, EffectNames], float] = {}
@@ -474,7 +476,9 @@ def generate_event_times(
         stamps = np.unique(
             np.concatenate([run_data.scenario.times for run_data in evaluator.prepared_runs])
         )
+        # Between two samples, the exact time does not matter.
         midpoints = (stamps[1:] + stamps[:-1]) / 2.0
+        # Distance of the event times that scores try.
         grid_spacing = (clock_end - clock_start) / (EVENT_TIME_COUNT + 1)
         near_midpoints = midpoints[np.abs(midpoints - coefficients[i]) <= grid_spacing]
         # At most MAX_EVENT_TIME_SUBDIVISIONS of them, equally spaced: the quotient is rounded up,

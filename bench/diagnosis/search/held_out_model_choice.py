@@ -122,7 +122,8 @@ class HeldOutValidation:
             if no extension is clearly better, or if none of its further effects helps.
         """
         names = set(model.effects)
-        # Of the models that contain all effects of the model, those that fit the runs best.
+        # An extension has all effects of the model and further ones. Those that fit the runs best
+        # (lowest cost) are compared.
         extensions = [m for m in search.models.values() if names < set(m.effects)]
         extensions = sorted(extensions, key=lambda m: m.fit.cost)[:MAX_RICHER_MODELS]
         fitted_models = search.models.values()

@@ -257,6 +257,7 @@ def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
         if p_value > level:
             return replace(size_result, p_value=p_value, where=variable, p_value_threshold=level)
     # 3. Hat forces.
+    # A hat acts only while time, a position or the speed is in an interval.
     # Scores need derivatives at the parameters of the model itself.
     model = models.refine_jacobian(model)
     directions = compute_hat_directions(evaluator, model)
@@ -433,7 +434,8 @@ def _iterate_families(evaluator: RunEvaluator) -> Iterator[_HatFamily]:
     """
     system = evaluator.simulator.system
     speed = _compute_high_speed(evaluator)
-    # Each direction has its index and the speed over which dry friction reverses.
+    # Each direction has its index and the speed over which dry friction reverses. The indices are 0
+    # against the motion, 1 for dry friction, and then one for each axis.
     against, dry, *axes = [
         (direction, SIGN_CHANGE_SPEED_SHARE * speed)
         for direction in range(AXIS_DIRECTION + len(system.coordinates))

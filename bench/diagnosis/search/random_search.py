@@ -91,7 +91,8 @@ class RandomStartSearch:
         self._means = [start.mean for start in smoothed]
         # `compute_root` takes a batch of matrices; here a batch of one.
         self._roots = [compute_root(start.covariance[None])[0] for start in smoothed]
-        # Of each run: the best deviate so far (s,), and the covariance of the next deviates.
+        # Of each run with s initial states: the best deviate so far (s,), and the covariance (s, s)
+        # of the next deviates. An initial state is its mean plus the root times a deviate.
         self._deviates = [np.zeros(mean.size) for mean in self._means]
         self._covariances = [np.eye(mean.size) for mean in self._means]
         self._is_recorded = np.isfinite(evaluator.observed)
@@ -110,10 +111,12 @@ class RandomStartSearch:
 
         Args:
             theta: (P,) parameters, with the coefficients from which the search starts.
-            indices: indices in theta of the K coefficients that are varied.
+            indices: indices in theta of the K coefficients that are varied; empty to vary the
+                initial states only.
             widths: (K,) standard deviations of these coefficients in the first round.
             bounds: (K, 2) lower and upper bounds of these coefficients.
         """
+        # Number of readings, for the mean square.
         sample_count = int(self._is_recorded.sum())
         best_theta, centre, lowest_cost = theta.copy(), theta[list(indices)], np.inf
         spread = widths.astype(np.float64)

@@ -37,9 +37,11 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
     # An effect that is no family is its own only member.
     members = members_of(effect)
     kind = effect.coefficients[0].of
+    # A compliance.
     if kind == "give":
         # The coefficients after the first one are shape parameters.
         return np.array([list_coefficients(evaluator, name)[0].bounds[1]])
+    # A force, or a level that is not recorded.
     if kind == "drive" or (kind == "level" and not _get_limited_channel(evaluator, effect)):
         return np.array([p.bounds[1] for p in list_coefficients(evaluator, name)])
     if kind == "travel":

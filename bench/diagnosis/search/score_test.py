@@ -411,6 +411,8 @@ class ScoreTest:
         products = InnerProducts(self._design, residual[None], surrogates)
         # The sums of products from one pass over the samples serve every correlation of the grid.
         for phi, determinant in self._determinants.items():
+            # Sums of squares of the residuals, products of directions that act together, and those
+            # of directions with residuals.
             total, grams, cross = products.project(phi)
             table.begin_correlation(phi, determinant, total)
             # Each batch has the groups with the same number of columns and sign constraints.
@@ -488,7 +490,7 @@ class _BestScores:
     def begin_correlation(self, phi: float, determinant: float, total: Array) -> None:
         """Start a value of the AR(1) correlation: compute the likelihoods without effects.
 
-        All likelihoods of `add_batch` are compared with it, until `end_correlation`.
+        All calls of `add_batch` until `end_correlation` refer to this correlation.
 
         Args:
             phi: AR(1) correlation of the noise.
@@ -496,6 +498,7 @@ class _BestScores:
             total: (S,) sums of squares of the whitened residuals.
         """
         self._phi, self._determinant, self._total_squares = phi, determinant, total
+        # `add_batch` collects the explained squares at this correlation.
         self._explained_squares[...] = 0.0
         value_without_effects = self._compute_log_likelihood(total, total)
         self._best_without_effects = np.maximum(self._best_without_effects, value_without_effects)
@@ -531,8 +534,8 @@ class _BestScores:
             coefficients: (n, k) coefficients of the groups for the first residual, the observed
                 one.
         """
-        # Best group of each effect: groups are sorted by effect, so that the groups of an effect
-        # are neighbours, and `reduceat` takes the maximum over each effect.
+        # Best group of each effect of this batch: groups are sorted by effect, so that the groups
+        # of an effect are neighbours, and `reduceat` takes the maximum over each effect.
         effect_rows = self._effect_rows[batch.group_indices]
         order = np.argsort(effect_rows, kind="stable")
         batch_rows, first_of_effect = np.unique(effect_rows[order], return_index=True)

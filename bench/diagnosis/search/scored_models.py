@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -181,14 +181,18 @@ class ScoredModelSet(ModelSet):
         2. The directions of the other models are simulated, one model in each worker.
         3. The oldest directions are removed if they take too much memory.
 
+        Results are stored by the key of a model: the set of its effects.
+
         Args:
             models: models to score.
             other_kept_models: further models whose stored results must not be removed.
         """
         # One entry for each model whose directions must be simulated.
-        scan_arguments, keys, effect_counts = [], [], []
+        scan_arguments: list[tuple[Any, ...]] = []
+        keys: list[frozenset[str]] = []
         for model in models:
             self._report_scoring(model)
+            # Scores need derivatives at the parameters of the model itself.
             model = self.refine_jacobian(model)
             key = frozenset(model.effects)
             residual = self.compute_residual(model.fit)
@@ -207,7 +211,6 @@ class ScoredModelSet(ModelSet):
                 continue
             missing_effects = self._list_addable_effects(model)
             keys.append(key)
-            effect_counts.append(len(missing_effects))
             # Arguments of `_scan_model` in a worker.
             scan_arguments.append(
                 (
@@ -220,26 +223,41 @@ class ScoredModelSet(ModelSet):
                 )
             )
         # 2. The other models.
+        for key, scan in zip(keys, self._scan_in_workers(scan_arguments), strict=True):
+            # Stored scores remain valid if only the directions of the model were removed.
+            scores = self.scores_by_effects.get(key, scan.scores)
+            self._store_scores(key, scan._replace(scores=scores))
+        # 3. Memory.
+        self._limit_cache_size([*keys, *(frozenset(model.effects) for model in other_kept_models)])
+
+    def _scan_in_workers(self, scan_arguments: Sequence[tuple[Any, ...]]) -> list[ModelScan]:
+        """Simulate and score the effects that several models lack, one model in each worker.
+
+        Args:
+            scan_arguments: for each model, the arguments of `_scan_model` after the evaluator; the
+                second one are the names of the missing effects.
+
+        Returns:
+            Directions, tests and scores of each model, in the order of the arguments.
+        """
         if scan_arguments:
+            max_effect_count = max(
+                len(missing_effects) for _, missing_effects, *_ in scan_arguments
+            )
             further_text = (
                 f" added to each of {len(scan_arguments)} models" if len(scan_arguments) > 1 else ""
             )
             self.evaluator.search_control.begin_stage(
-                f"testing {max(effect_counts)} effects{further_text}", len(scan_arguments)
+                f"testing {max_effect_count} effects{further_text}", len(scan_arguments)
             )
         # The workers return the results in any order.
-        scans = {}
+        scans: dict[int, ModelScan] = {}
         for model_index, scan in self.evaluator.worker_pool.map_unordered(
             self.evaluator, _scan_model, scan_arguments
         ):
             scans[model_index] = scan
             self.evaluator.search_control.advance()
-        for model_index, key in enumerate(keys):
-            # Stored scores remain valid if only the directions of the model were removed.
-            scores = self.scores_by_effects.get(key, scans[model_index].scores)
-            self._store_scores(key, scans[model_index]._replace(scores=scores))
-        # 3. Memory.
-        self._limit_cache_size([*keys, *(frozenset(model.effects) for model in other_kept_models)])
+        return [scans[model_index] for model_index in range(len(scan_arguments))]
 
     def _report_scoring(self, model: FittedModel) -> None:
         """Report to the user that a model is scored now, and stop if the search has to end."""
@@ -254,6 +272,9 @@ class ScoredModelSet(ModelSet):
         Directions are the responses of the runs to all effects that a model lacks, and take much
         memory. Those of the base model (the empty key) and of the models `kept_keys` are needed
         next; they are never removed, and those of the base model are not counted.
+
+        Args:
+            kept_keys: models whose directions are kept, each as the set of its effects.
         """
         # Directions about replaced fits are removed first. A dictionary has its oldest entries
         # first.
@@ -401,6 +422,10 @@ class ScoredModelSet(ModelSet):
         This is the case if no fit of these effects is known. For a robot, whose effects start far
         from the optimum, a known fit may have stopped in a poor local minimum: it is worse than the
         model `model`, which it contains. Then it is fitted again.
+
+        Args:
+            start: start of a fit of `model` with one more effect.
+            model: the fitted model that is extended.
         """
         stored_model = self.models.get(frozenset(start.effects))
         if stored_model is None:
@@ -412,8 +437,11 @@ class ScoredModelSet(ModelSet):
     def _list_simpler_models(self, start: FitStart) -> set[frozenset[str]]:
         """Return the models in which one effect of a start is replaced by a simpler one.
 
-        The effect contains the simpler one. If such a model already leaves only noise, the start
-        need not be fitted.
+        The effect contains the simpler one: it acts like it at some values of its coefficients. If
+        such a model already leaves only noise, the start need not be fitted.
+
+        Args:
+            start: start of a fit, with its effects.
 
         Returns:
             The models, each as the set of its effects.
@@ -451,7 +479,7 @@ class ScoredModelSet(ModelSet):
         """
         # Gain in twice the log-likelihood.
         gain = larger.likelihood.value - model.likelihood.value
-        # The given model may be a refit, while the scores belong to the fit of the search.
+        # The given model may be a refit, while the stored scores belong to the fit of the search.
         model = self.models[frozenset(model.effects)]
         # 1. Residual of the smaller model.
         p_value = self.compute_gain_p_value(self.score_missing_effects(model), larger, gain)
@@ -508,6 +536,9 @@ class ScoredModelSet(ModelSet):
            `MAX_AUTOCORRELATED_NOISE_RATIO`, and the Ljung-Box test accepts it as AR(1) noise. The
            floor is estimated for white noise, so AR(1) noise may exceed it (see
            `verdict_rules.exceeds_noise`).
+
+        Args:
+            model: fitted model, with the standard deviation of its residual in each channel.
         """
         # A model that could not be simulated has no residual.
         if not np.isfinite(model.fit.cost):

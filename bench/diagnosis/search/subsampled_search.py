@@ -76,7 +76,7 @@ def thin_runs(evaluator: RunEvaluator) -> RunEvaluator | None:
         long as an engine step, or if a channel would lose too many samples.
     """
     total = int(evaluator.lengths.sum())
-    # Of each run, every n-th sample is kept; n is its factor.
+    # Of each run, every n-th sample is kept; n is its factor, at most this one.
     max_factor = total // MIN_THINNED_SAMPLES
     factors = [min(_compute_factor(run), max_factor) for run in evaluator.runs]
     if total < MIN_SAMPLES_TO_THIN or max(factors) < 2:
@@ -118,8 +118,9 @@ def _search_subsampled(search: EffectSearch, thinned_runs: RunEvaluator) -> Fitt
             `search`.
     """
     # 1. No effect.
-    # The scores of the base model are needed in any case, to penalise effects with many shapes. If
-    # they show nothing, `run` returns the base model at once.
+    # The scores of the base model are needed in any case: they show how much each effect gains from
+    # noise alone, by which it is penalised. If they show nothing, `run` returns the base model at
+    # once.
     if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
         return search.run()
     # 2. Subsampled runs.

@@ -52,9 +52,17 @@ class LaggedSums(NamedTuple):
     def combine(self, phi: float) -> Array:
         """Combine the three sums to the inner products (W a)'(W b) of whitened columns, eq. (1).
 
-        It is ((1 + phi^2) sum a_t b_t - phi sum a_t (b_{t-1} + b_{t+1}) - phi^2 sum n_t a_t b_t) /
-        (1 - phi^2), with the AR(1) correlation phi and n_t the number of missing neighbours of
-        sample t. The three sums are `same_samples`, `neighbours` and `run_ends`.
+        A column is a signal over all samples, here a or b. W is the whitening by the AR(1)
+        correlation phi. The product is
+
+        ((1 + phi^2) sum a_t b_t - phi sum a_t (b_{t-1} + b_{t+1}) - phi^2 sum n_t a_t b_t) /
+        (1 - phi^2),
+
+        with n_t the number of missing neighbours of sample t. The three sums are `same_samples`,
+        `neighbours` and `run_ends`.
+
+        Args:
+            phi: AR(1) correlation of the noise.
         """
         square = phi * phi
         scaled_products = (
@@ -460,7 +468,11 @@ class WhiteningDesign:
         2. Project out the initial states of each run, then the parameters of all runs.
         3. Mark the directions of which nothing remains.
         4. Project the products of directions that act together.
+
+        Args:
+            phi: AR(1) correlation of the noise.
         """
+        # The first columns of the Jacobian are the parameters, the others the initial states.
         parameter_count = self._parameter_count
         # 1. Whitening.
         # Products J'J (R, q + s, q + s), those of J with the K directions (R, q + s, K), and the
@@ -477,6 +489,7 @@ class WhiteningDesign:
             [normal[:, parameter_count:, :parameter_count], mixed[:, parameter_count:]], axis=2
         )
         by_states = _project_directions(state_root, other_products)
+        # L'J'a of the initial states, with the parameters and with the directions as columns a.
         by_parameters = by_states[:, :parameter_count]
         by_directions = by_states[:, parameter_count:]
         # Products of the derivatives by the parameters, without what initial states absorb (q, q).
@@ -485,6 +498,7 @@ class WhiteningDesign:
             - by_parameters.T @ by_parameters
         )
         parameter_root = _compute_matrix_root(schur_complement)
+        # L'J'a of the parameters, with the directions as columns a (q, K).
         by_own_parameters = parameter_root.T @ (
             mixed[:, :parameter_count].sum(axis=0) - by_parameters.T @ by_directions
         )
@@ -497,22 +511,43 @@ class WhiteningDesign:
         acting = remaining > MIN_RESIDUAL_SHARE * squares
         remaining = np.where(acting, remaining, 0.0)
         # 4. Blocks.
+        grams = self._project_blocks(phi, absorbed, remaining, acting)
+        return _ReducedDesign(
+            state_root, by_states, parameter_root, by_own_parameters, grams, acting
+        )
+
+    def _project_blocks(
+        self, phi: float, absorbed: Array, remaining: Array, acting: Mask
+    ) -> list[Array]:
+        """Return the products of directions that act together, without what a fit absorbs.
+
+        A block is an array (n, k) of column indices: n groups of k directions that act together.
+        The absorbed part of the product of two directions a and b is (L'J'a)'(L'J'b), eq. (2).
+
+        Args:
+            phi: AR(1) correlation of the noise.
+            absorbed: (R s + q, K) L'J'a of the K directions a, for the s initial states of each of
+                R runs and for q parameters.
+            remaining: (K,) sum of squares of each direction that is not absorbed.
+            acting: (K,) mask of the directions of which something remains.
+
+        Returns:
+            Products (n, k, k) of each block; zero for directions that are absorbed.
+        """
         grams = []
         for block, block_sums in zip(self.blocks, self._block_products, strict=True):
             # A single direction has only its square.
             if block.shape[1] == 1:
                 grams.append(remaining[block][:, :, None])
                 continue
-            # (n, k, R s + q) for n groups of k directions.
+            # (n, k, R s + q)
             columns = np.moveaxis(absorbed[:, block], 0, 2)
             gram = block_sums.combine(phi) - columns @ columns.transpose(0, 2, 1)
             # Rounding makes the two halves differ, and the eigensolver reads only one of them.
             symmetric = (gram + gram.transpose(0, 2, 1)) / 2.0
             is_pair_acting = acting[block][:, :, None] & acting[block][:, None, :]
             grams.append(np.where(is_pair_acting, symmetric, 0.0))
-        return _ReducedDesign(
-            state_root, by_states, parameter_root, by_own_parameters, grams, acting
-        )
+        return grams
 
 
 class InnerProducts:

@@ -100,7 +100,7 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     # A single run has no scatter.
     if not models.has_contact_jumps or len(fisher_blocks.parameters) == 1:
         return covariance
-    # Only robots on the ground need this import, which takes long.
+    # Only models with contact jumps need this import, which takes long.
     from scipy.special import stdtrit
 
     gradients = _compute_run_scores(models, model, fisher_blocks)
@@ -111,6 +111,7 @@ def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
     # Few runs estimate their scatter poorly: quantile of Student's t instead of the normal one.
     scatter_variances *= np.square(stdtrit(count - 1, 0.975) / Z95)
     variances = np.maximum(np.diagonal(covariance), np.finfo(float).tiny)
+    # Factors of the standard errors, at least 1, so that variances never become smaller.
     factors = np.sqrt(np.maximum(scatter_variances / variances, 1.0))
     widened: Array = covariance * np.outer(factors, factors)
     return widened
@@ -147,14 +148,17 @@ def invert_scaled(parameter_curvature: Array, schur_complement: Array) -> Array:
     """Invert the curvature after elimination of the initial states, which gives the covariance.
 
     Directions that the data do not identify get a huge variance instead of a division by zero: the
-    eigenvalues have the lower limit `MIN_EIGENVALUE`. Parameters are scaled by their own curvature
-    before, so that this limit does not depend on units.
+    eigenvalues of the scaled curvature have the lower limit `MIN_EIGENVALUE`. Parameters are scaled
+    by their own curvature before, so that this limit does not depend on units.
 
     Shapes: q fitted parameters.
 
     Args:
         parameter_curvature: (q, q) curvature by the parameters alone, which scales the inversion.
         schur_complement: (q, q) curvature after elimination of the initial states.
+
+    Returns:
+        The covariance (q, q), in the units of the parameters.
     """
     diagonal = np.diagonal(parameter_curvature)
     scale = np.sqrt(np.maximum(diagonal, MIN_CURVATURE))

@@ -65,8 +65,9 @@ class CrossValidation(Validation):
     def validate(self, fits: Sequence[TrajectoryFit]) -> list[HeldOutFit]:
         """Predict each run with every model, refitted to the other runs.
 
-        Only the initial states of the predicted run are estimated from it. An effect that the other
-        runs do not support is switched off for the prediction.
+        The runs of one fold are left out together. Only the initial states of a predicted run are
+        estimated from it. An effect that the other runs do not support is switched off for the
+        prediction.
 
         Args:
             fits: models as fitted to all runs, from which the refits start.
@@ -169,7 +170,8 @@ class CrossValidation(Validation):
         Returns:
             Parameters (P,) of each model; an effect that these runs do not show is switched off.
         """
-        # All models of a search keep the same base parameters fixed at their nominal values.
+        # All models of a search keep the same base parameters fixed at their nominal values, so the
+        # first fit shows which ones are fixed.
         base_parameters = set(self.evaluator.base_indices.tolist())
         fixed_parameters = frozenset(base_parameters - set(fits[0].free_indices.tolist()))
         length = fold.fitted_runs.observed.shape[1]
@@ -200,7 +202,8 @@ class CrossValidation(Validation):
             fits: fits of all models to these runs.
         """
         thetas = [fit.theta.copy() for fit in fits]
-        # Every effect of every model is switched off once: index of the model, and coefficients.
+        # Every effect of every model is switched off once: index of the model, and indices of the
+        # effect's coefficients in theta.
         removals = [
             (model_index, evaluator.get_coefficient_indices(name))
             for model_index, fit in enumerate(fits)

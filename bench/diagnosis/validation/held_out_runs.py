@@ -137,7 +137,8 @@ class HeldOutRuns(Validation):
         The nearest fit is the one with the lowest cost.
 
         1. Fit the initial states of all models, over ever longer parts of the runs. For filtered
-           runs, whose initial states are known well, one stage with whole runs is tried first.
+           runs (of a robot, whose initial states a Kalman filter has estimated well), one stage
+           with whole runs is tried first.
         2. If even the nearest of these is far from the noise, fit them in another way.
         3. If the motion has left the range of its linearisation, continue with derivatives at the
            nearest fit.
@@ -149,8 +150,8 @@ class HeldOutRuns(Validation):
 
         Args:
             thetas: parameters of each model.
-            is_staged: whether to fit ever longer parts of the runs even if a fit to whole runs
-                comes near the noise.
+            is_staged: whether to fit ever longer parts of filtered runs, too, even if a fit to
+                whole runs comes near the noise.
 
         Returns:
             The prediction of the runs by each model.
@@ -166,7 +167,8 @@ class HeldOutRuns(Validation):
         # 2. Poor fits.
         if is_filtered and self._are_poor(fits):
             fits, is_filtered = self._improve_poor_fits(starts, fits)
-        # 3. Derivatives.
+        # 3. Derivatives. A fit in stages may end far from the motion about which they were
+        # computed.
         if not is_filtered and self._leaves_linear_range(_find_lowest_cost_fit(fits)):
             fits = self._continue_from_nearest(starts, fits)
         # 4. Far models. These initial states are good over the first fraction of the runs already.
@@ -184,7 +186,7 @@ class HeldOutRuns(Validation):
     def _improve_poor_fits(
         self, starts: Sequence[FitStart], fits: Sequence[TrajectoryFit]
     ) -> tuple[list[TrajectoryFit], bool]:
-        """Fit filtered runs in another way, and keep the better fit of each model.
+        """Fit filtered runs (of a robot) in another way, and keep the better fit of each model.
 
         - A robot on the ground, whose contacts a fit of states would lift or press in, starts from
           states with settled contacts.
@@ -195,7 +197,8 @@ class HeldOutRuns(Validation):
             fits: poor fit of each model.
 
         Returns:
-            The better fits, and whether they were made in the way of filtered runs, in one stage.
+            The better fits, and whether the next fits may also use the single stage of filtered
+            runs.
         """
         filtered_runs = self.evaluator.filtered_runs
         if filtered_runs is not None and filtered_runs.is_on_ground:
@@ -279,7 +282,7 @@ class HeldOutRuns(Validation):
             repeated_theta, np.arange(runs), evaluator.initial_state_guesses
         )
         state_changes = fit.initial_states - evaluator.initial_state_guesses
-        # A diverging simulation from the guess is infinite or NaN.
+        # Simulated change minus predicted change; a diverging simulation is infinite or NaN.
         with np.errstate(over="ignore", invalid="ignore"):
             linearisation_error = (
                 fit.simulated
@@ -296,9 +299,10 @@ class HeldOutRuns(Validation):
     ) -> list[TrajectoryFit]:
         """Continue the fits with derivatives at the nearest of them.
 
-        If that reduces the nearest sum of squares enough, the fits are repeated from the starts
-        with derivatives that are computed again before each stage. The best fit of each model is
-        returned.
+        The nearest fit is the one with the lowest cost (sum of squares). If new derivatives reduce
+        this cost enough, those of the first fits were wrong, so the fits are repeated from the
+        starts with derivatives that are computed again before each stage. The best fit of each
+        model is returned.
 
         Args:
             starts: model, parameters and first initial states of each fit.

@@ -118,6 +118,8 @@ def compute_run_covariates(
 def classify_constant(evaluator: RunEvaluator, name: str) -> CovariateKind:
     """Return the category of a constant that differs between runs, from its unit.
 
+    A mass, inertia, force or torque is a load, a voltage a supply.
+
     Args:
         evaluator: Run evaluator; its simulator declares the constants.
         name: Name of the constant.
@@ -130,7 +132,7 @@ def classify_constant(evaluator: RunEvaluator, name: str) -> CovariateKind:
 
 
 def _list_non_motion_covariates(evaluator: RunEvaluator) -> Iterator[RunCovariate]:
-    """Yield the covariates of each run that do not depend on its motion.
+    """Yield the covariates that do not depend on the motion, each with a value for every run.
 
     A covariate is a quantity that may explain why a parameter differs between runs. They are the
     order of the runs, the root mean square of each command, and the mean of each recorded signal
@@ -357,6 +359,9 @@ def compute_prediction_half_widths(
     Args:
         consistencies: Consistency of each parameter between runs, and between logs if there are
             several.
+
+    Returns:
+        Half the width of the 95 % prediction interval by name of the parameter, in its unit.
     """
     # A new log is more general than a new run, so that it comes later and replaces it. Groups by a
     # constant, such as a load, are not used.
@@ -412,7 +417,7 @@ def _find_trend_covariate(
     def get_scatter(candidate: tuple[RunCovariate, Trend]) -> float:
         """Return the mean square of the estimates about the line, in units of their errors."""
         _, trend = candidate
-        # The mean square about the line is at least that of the errors, 1.
+        # A mean square below 1, that of the errors alone, is chance, so such covariates are equal.
         return max(trend.mean_square, 1.0)
 
     best = min(significant_trends, key=get_scatter)
@@ -496,9 +501,9 @@ def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
 def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple[Array, Array]:
     """Compute the normal equations of the q parameters for each run.
 
-    They show by how much each run alone would change the joint fit, without fitting it again. They
-    are the curvatures H (R, q, q) and the gradients g (R, q), after the initial states of the run
-    are eliminated (1):
+    They show by how much each run alone would change the joint fit, that of all runs together,
+    without fitting it again. They are the curvatures H (R, q, q) and the gradients g (R, q), after
+    the initial states of the run are eliminated (1):
 
         H = A'A - A'B S^-1 B'A,    g = A'e - A'B S^-1 (B'e + prior),    S = B'B + diag sigma_0^-2
 
@@ -510,11 +515,15 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
     Args:
         models: the models, with the runs.
         model: fitted model: its effects, parameters, initial states and likelihood.
+
+    Returns:
+        Curvatures H and gradients g; H^-1 g is the step to which a run alone would lead.
     """
     evaluator, fit = models.evaluator, model.fit
     q = fit.free_indices.size
     fisher_blocks = compute_fisher_blocks(models, model)
     residual = whiten(models.compute_residual(fit), models.observed_mask, fisher_blocks.noise)
+    # A'e and B'e of each run; the latter gets the part of the prior below.
     all_gradients = np.einsum(
         "rnk,rn->rk", fisher_blocks.jacobian, residual.reshape(len(residual), -1)
     )
@@ -544,10 +553,11 @@ def _test_parameters(
 ) -> Iterator[ParameterConsistency]:
     """Test for each parameter whether the groups of runs agree on it.
 
-    Each group G alone would change the joint fit by the Gauss-Newton step d_G = H_G^-1 g_G, with
-    the covariance H_G^-1, where H_G and g_G are sums over its runs (2). A group whose interval is
-    too wide is left out, and a parameter needs at least two groups. The results are not yet marked
-    as inconsistent, because the significance level depends on the number of all tests.
+    Each group G alone would change the fit of all runs together (the joint fit) by the Gauss-Newton
+    step d_G = H_G^-1 g_G, with the covariance H_G^-1, where H_G and g_G are sums over its runs (2).
+    A group whose interval is too wide is left out, and a parameter needs at least two groups. The
+    results are not yet marked as inconsistent, because the significance level depends on the number
+    of all tests.
 
     Shapes: R runs, q fitted parameters.
 
@@ -557,21 +567,27 @@ def _test_parameters(
         grouping: Groups of runs, for example one for each load.
         curvatures: (R, q, q) H_r, the information of each run on the parameters.
         gradients: (R, q) g_r, the gradient of each run's log-likelihood by the parameters.
+
+    Yields:
+        The estimates of the groups, their scatter, its p-value and, for ordered groups, the trend,
+        for each parameter that two groups identify.
     """
-    joint_errors = _compute_errors(_invert(curvatures))
+    joint_errors = _compute_errors(_invert_total(curvatures))
     # Step and standard errors (q,) of each group.
     steps, errors = [], []
     for runs in grouping.runs:
-        group_covariance = _invert(curvatures[list(runs)])
+        group_covariance = _invert_total(curvatures[list(runs)])
         steps.append((group_covariance @ gradients[list(runs)].sum(axis=0)).tolist())  # (2)
         errors.append(_compute_errors(group_covariance))
-    # Without an order of the groups, there is no trend.
+    # Value of the covariate, such as the load. Groups without an order have no such values, and
+    # these zeros are not used.
     covariate_of_group = grouping.numbers or (0.0,) * len(grouping.names)
     for column, index in enumerate(model.fit.free_indices.tolist()):
         parameter, value = evaluator.parameters[index], float(model.fit.theta[index])
         low, high = parameter.bounds
         # Scale of the parameter, to which the width of an interval is compared.
         size = max(high - low, abs(value))
+        # Groups whose interval is narrow enough.
         group_estimates, covariate_values = [], []
         for name, group_steps, group_errors, covariate_value in zip(
             grouping.names, steps, errors, covariate_of_group, strict=True
@@ -600,7 +616,7 @@ def _test_parameters(
         )
 
 
-def _invert(curvatures: Array) -> Array:
+def _invert_total(curvatures: Array) -> Array:
     """Invert the sum of the curvatures (R, q, q) of runs; see `invert_scaled`."""
     curvature = curvatures.sum(axis=0)
     return invert_scaled(curvature, curvature)
@@ -612,14 +628,14 @@ def _compute_errors(covariance: Array) -> list[float]:
     return errors
 
 
-def _weigh(group_estimates: Sequence[GroupEstimate]) -> tuple[Array, Array]:
+def _list_values_and_weights(group_estimates: Sequence[GroupEstimate]) -> tuple[Array, Array]:
     """Return the values of the groups, and their weights: the squares of the inverse errors."""
     values = np.array([part.value for part in group_estimates])
     return values, np.array([part.error for part in group_estimates]) ** -2.0
 
 
 def _estimate_heterogeneity(group_estimates: Sequence[GroupEstimate]) -> tuple[float, float]:
-    """Estimate by how much groups differ beyond their errors, and the p-value of no difference.
+    """Estimate by how much groups differ beyond their errors, and test if they differ at all.
 
     For n groups with the estimates x and the weights w = 1 / var, Cochran's Q is compared with a
     chi-squared distribution with n - 1 degrees of freedom, and tau is the standard deviation
@@ -632,9 +648,9 @@ def _estimate_heterogeneity(group_estimates: Sequence[GroupEstimate]) -> tuple[f
         group_estimates: Estimate and standard error of each group.
 
     Returns:
-        tau and the p-value.
+        tau, in the unit of the parameter, and the p-value of the hypothesis of equal groups.
     """
-    values, weights = _weigh(group_estimates)
+    values, weights = _list_values_and_weights(group_estimates)
     weighted_mean = float(weights @ values / weights.sum())
     q = float(weights @ (values - weighted_mean) ** 2)  # (3)
     degrees_of_freedom = len(group_estimates) - 1
@@ -662,7 +678,7 @@ def _fit_trend(group_estimates: Sequence[GroupEstimate], covariate_values: Array
     """
     if len(group_estimates) < 3 or not np.ptp(covariate_values) > 0:
         return None
-    values, weights = _weigh(group_estimates)
+    values, weights = _list_values_and_weights(group_estimates)
     centred = covariate_values - weights @ covariate_values / weights.sum()
     spread = float(weights @ centred**2)
     slope = float(weights @ (centred * values)) / spread

@@ -130,12 +130,15 @@ def split_name(text: str) -> list[str]:
 def guess_role(column: LogColumn) -> Role | None:
     """Guess the role of a column from its name and unit, or else from the name of its file.
 
-    The first of these decides:
+    The role is the quantity of the signal. The first of these decides:
 
     1. Words for a command in the column's name: ``position_command`` is a command. In the file's
        name they count unless the column's name has a word for another quantity, such as an error.
     2. The quantity of the column's unit, such as "torque" for N*m.
     3. Other words of the column's name, then of the file's name.
+
+    Args:
+        column: Column of a log, with the name of its file.
 
     Returns:
         Command, position, velocity, force or other; None if nothing indicates a role.
@@ -156,6 +159,9 @@ def get_commanded_role(column: LogColumn) -> Role | None:
 
     The column's unit decides (an angle or a length is a position). Without a unit, words of the
     column's name do, then words of its file's name.
+
+    Args:
+        column: Column that contains a command.
     """
     if column.quantity in _ROLE_OF_QUANTITY:
         return _ROLE_OF_QUANTITY[column.quantity]
@@ -274,6 +280,7 @@ def match_numbered_joints(
     if not columns or len(set(column_numbers.values())) < len(columns):
         return {}
     first, last = min(column_numbers.values()), max(column_numbers.values())
+    # The first number counts as that of the first joint, so the last one must have a joint, too.
     if last - first >= len(joints):
         return {}
     return {name: joints[number - first] for name, number in column_numbers.items()}
@@ -345,6 +352,7 @@ def guess_position_unit(values: Array, joint: Joint) -> str | None:
         return small_unit if is_in_degrees else si_unit
     if is_within_widened_range(extremes, joint.range, MAX_RANGE_EXCESS):
         return si_unit
+    # The same numbers, read in the small unit and converted to the unit of the range.
     converted_extremes = extremes / (DEGREES_PER_RADIAN if is_hinge else 1e3)
     if is_within_widened_range(converted_extremes, joint.range, MAX_RANGE_EXCESS):
         return small_unit

@@ -85,7 +85,7 @@ class DescriptionWriter:
         head += [f"model = {toml_text(self._make_relative(self._model))}"]
         free_servos = [servo.name for servo in servos if servo.is_free]
         if free_servos:
-            # An asterisk stands for all servos.
+            # An asterisk stands for all servos: it is used if all of them have free gains.
             places = ["*"] if len(free_servos) == len(servos) else free_servos
             names = [f"{gain}@{place}" for place in places for gain in FREE_GAINS]
             name_list = ", ".join(map(toml_text, names))
@@ -120,7 +120,9 @@ class DescriptionWriter:
                 yield ""
 
     def _format_file_lines(self, file: str) -> list[str]:
-        """Return the line with the file of a signal; none if each run is one file.
+        """Return the line that names the file of a signal, in a list.
+
+        The list is empty if each run is one file, because the table of the run names it.
 
         Args:
             file: name of the file in the folder of its run.
@@ -145,7 +147,8 @@ class DescriptionWriter:
         lines = [f"[{kind}.{toml_text(name)}]  # guess: {signal.description}"]
         lines += self._format_file_lines(column.file)
         lines += [f"column = {toml_text(column.name)}", f"unit = {toml_text(signal.unit)}"]
-        # A scale in the description shows later checks that the positions are not normalised.
+        # Degrees without a scale may raise the warning that the positions may be normalised. A
+        # scale of 1 shows later checks that the user has stated the unit.
         is_stated = self._options.position_unit == "deg" and name.startswith("q.")
         if signal.scale != 1.0 or is_stated:
             lines.append(f"scale = {signal.scale!r}")

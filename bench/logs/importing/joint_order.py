@@ -97,6 +97,7 @@ def find_order_by_model(
     # SciPy's signal module is slow to import.
     from scipy.signal import savgol_filter
 
+    # Times, commands (J, T) and positions (J, T).
     t, u, q = times[is_usable], np.array(commands)[:, is_usable], np.array(positions)[:, is_usable]
     step = float(np.median(np.diff(t)))
     # (3, J, T): positions, velocities and accelerations.
@@ -209,6 +210,7 @@ def find_order_by_commands(
     if distances is None:
         return None
     order = _find_best_order(distances)
+    # Commands that another position follows better than that of their own joint.
     moved_commands = [command for command, position in enumerate(order) if position != command]
     if not moved_commands:
         return None
@@ -237,8 +239,8 @@ def are_followed(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
 def _find_best_order(distances: Array) -> list[int]:
     """Return the order in which the positions are closest to the commands.
 
-    It is the permutation p that minimises d(p) = sqrt(sum_i mean((u_i - q_p(i))^2)) (1), with
-    commands u_i and positions q_j, found by linear assignment.
+    The order is the permutation p that minimises d(p) = sqrt(sum_i mean((u_i - q_p(i))^2)) (1),
+    with commands u_i and positions q_j, found by linear assignment.
 
     Args:
         distances: (J, J) mean square distance of each command (rows) from each position (columns),
@@ -348,7 +350,8 @@ def assign_order(
     are_positions_guessed = all(
         signals.channels[name].placement.is_order for name in servos.channels
     )
-    if not servos.commands:  # orders cannot or need not be compared
+    # `servos` has no values if orders cannot or need not be compared.
+    if not servos.commands:
         _report_order(signals, [], result)
         return {}
     exchanged = {}
@@ -363,7 +366,7 @@ def assign_order(
         if preferred:
             return preferred
     _report_order(signals, servos.joints if is_following else [], result)
-    # If the order of the commands is a guess, these were exchanged, and not the positions.
+    # The result concerns positions. If the order of the commands is a guess, these were exchanged.
     return exchanged if are_positions_guessed and not are_commands_guessed else {}
 
 
@@ -388,20 +391,26 @@ def _collect_servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSi
     ]
     names = [joint.name for joint in joints]
     inputs = [signals.get_servo_input(name) for name in names]
+    # Command and position of each joint.
     pairs = [
-        (signals.inputs[u], signals.channels[f"q.{name}"])
-        for u, name in zip(inputs, names, strict=True)
+        (signals.inputs[input_name], signals.channels[f"q.{name}"])
+        for input_name, name in zip(inputs, names, strict=True)
     ]
     is_guess = any(signal.placement.is_order for pair in pairs for signal in pair)
-    # Command and position at the sample times of the position.
-    value_pairs = [logs.hold_command(u.column, q.column) for u, q in pairs]
+    # Their values (T,) at the sample times of the position, in the units of the columns.
+    value_pairs = [
+        logs.hold_command(command.column, position.column) for command, position in pairs
+    ]
     # Positions of one file share their sample times; those of several files may not.
-    if len(joints) < 2 or not is_guess or len({u.size for u, _ in value_pairs}) > 1:
+    sample_counts = {command_values.size for command_values, _ in value_pairs}
+    if len(joints) < 2 or not is_guess or len(sample_counts) > 1:
         return _ServoSignals(names, inputs, [], [])
     commands, positions = [], []
-    for joint, (command, position), (u, q) in zip(joints, pairs, value_pairs, strict=True):
-        commands.append(command.convert(joint.unit, u))
-        positions.append(position.convert(joint.unit, q))
+    for joint, (command, position), (command_values, position_values) in zip(
+        joints, pairs, value_pairs, strict=True
+    ):
+        commands.append(command.convert(joint.unit, command_values))
+        positions.append(position.convert(joint.unit, position_values))
     return _ServoSignals(names, inputs, commands, positions)
 
 
@@ -426,7 +435,8 @@ def _follow_commands(
         return {}
     joints = servos.joints
     if are_commands_guessed:
-        # Each command moves to its position, so the order is reversed.
+        # `order` has the position of each command. The position columns stay, so each position gets
+        # the command that it follows: the inverse permutation.
         inverse_order = np.argsort(order).tolist()
         _reorder(signals.inputs, servos.inputs, inverse_order, Placement.COMMANDS)
     else:
@@ -487,7 +497,7 @@ def _prefer_model(
         return {}
     _reorder(signals.channels, servos.channels, preferred.order, Placement.MODEL)
     _reorder(signals.inputs, servos.inputs, preferred.order, Placement.MODEL)
-    # Joints in the order of their columns in the log.
+    # Joints in the order of their columns in the log: `order` has the column index of each joint.
     columns = sorted(joints, key=lambda joint: preferred.order[joints.index(joint)])
     result.checks.append(
         "order of joints: the log does not name those of its columns; they are taken in the "

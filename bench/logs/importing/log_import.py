@@ -118,6 +118,7 @@ def describe_logs(
     assign_velocities(run_logs, signals, exchanged, result)
     assigner.assign_efforts()
     assigner.find_switches()
+    # Columns that nothing has used are reported last.
     assigner.report_missing_inputs()
     assigner.report_unused()
     result.text = DescriptionWriter(run_logs, signals, options, model, folder, result).write()

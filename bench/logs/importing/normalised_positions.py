@@ -116,6 +116,7 @@ def find_position_conversion(
             "out --calibration and --position-unit normalised"
         )
     if calibration is None and is_within_range and not stated_unit:
+        # Only a log of a LeRobot dataset is an episode; its dataset may have a calibration file.
         episode = split_episode_path(log)
         if episode:
             dataset, _ = episode
@@ -160,7 +161,7 @@ def check_normalised_positions(recording: Recording) -> Iterator[Anomaly]:
         and str(table.get("unit", "")).startswith("deg")
         and "scale" not in table
     ]
-    # The recording is in radians.
+    # Largest magnitude in each run; the values of a recording are in radians.
     largest_angles = [
         float(np.nanmax(np.abs(run.channels[name]), initial=0.0))
         for run in recording.runs
@@ -189,6 +190,7 @@ def _has_dataset_episodes(description: Path, meta: Mapping[str, object]) -> bool
     folder = next((table.get("folder") for table in tables if isinstance(table, dict)), None)
     if not isinstance(folder, str):
         return False
+    # The name of a log in the folder of an episode; the log itself need not exist.
     return split_episode_path(description.parent / folder / "frames") is not None
 
 

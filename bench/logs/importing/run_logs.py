@@ -144,6 +144,7 @@ def _make_run_per_file(run: RunFiles) -> dict[str, RunFiles]:
     """
     tables = [path for path in run.paths if path.suffix.lower() in TABLE_ENDINGS and path.is_file()]
     stems = [path.stem for path in tables]
+    # There is a single file, some log is not a table file, or names of runs would repeat.
     if len(tables) < 2 or len(tables) < len(run.paths) or len(set(stems)) < len(stems):
         return {}
     columns = []
@@ -189,7 +190,8 @@ class RunLogs:
 
         Without time stamps (`rate` is given), the time of row k is k / rate in seconds. `_starts`
         has the first time stamp of each file in seconds from the earliest one of all files, and
-        `_cache` the files that were read already.
+        `_cache` the files that were read already. `seconds` has the times (T,) of the rows of each
+        file, from its first row, and `columns` the columns that may be imported.
 
         Args:
             runs: Files of each run.
@@ -206,6 +208,7 @@ class RunLogs:
         logs = self._read_first_run()
         if rate is not None:
             for file, log in logs.items():
+                # The longest column has all rows.
                 count = max(log.get_column(name).size for name in log.list_columns())
                 self.seconds[file], self._starts[file] = np.arange(count) / rate, 0.0
         else:
@@ -229,6 +232,7 @@ class RunLogs:
         """
         files = self.runs[run]
         paths = files.paths
+        # If each run is one file, its name differs from run to run and does not count.
         if not files.alone:
             paths = [path for path in paths if files.name(path) == column.file]
         if not paths:
@@ -297,6 +301,7 @@ class RunLogs:
                 self._leave_out_file(files.name(path), error, path)
                 continue
             logs[files.name(path)] = log
+        # No file can be read: the first error is the reason.
         if not logs:
             raise errors[0]
         return logs
@@ -357,7 +362,7 @@ class RunLogs:
             file: next((pair for pair in candidates if pair[0].name in common), candidates[0])
             for file, candidates in clocks.items()
         }
-        # Number of recognised columns by name and unit of the stamps.
+        # Number of columns with a known role, by name and unit of the stamps of their file.
         counts = Counter[tuple[str, str]]()
         for file, (column, unit) in clocks_by_file.items():
             roles = map(column_guessing.guess_role, _list_all_columns(file, logs[file]))

@@ -151,6 +151,8 @@ def _estimate_gains(
     response = estimate or DEFAULT_RESPONSE
     frequency, damping = response
     kp, kv = inertia * frequency**2, 2.0 * damping * frequency * inertia
+    # The log moves the joint if its response is known, or if the command changes and the position
+    # changes by more than `MIN_MOTION`. The gains are then free, and fitted by the diagnosis.
     is_moved = estimate is not None or any(
         np.ptp(u) > 0 and np.ptp(q[np.isfinite(q)]) > MIN_MOTION[joint.unit]
         for _, u, q in runs
@@ -187,10 +189,12 @@ def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> Servo
     step = float(np.median([np.median(np.diff(t)) for t, _, _ in moving]))
     responses = [ServoResponse(*pair) for pair in product(FREQUENCY_GRID, DAMPING_GRID)]
     numerators, denominators = _compute_transfer_functions(responses, step)
-    # Sum of squares of the residual over all runs, by response. The variance ignores an offset.
+    # Sum of squares of the residual over all runs, by response. The variance ignores a constant
+    # offset of the position.
     residuals = np.zeros(len(responses))
     for _, command, position in moving:
         for i in range(len(responses)):
+            # The filter begins at zero, so the command is counted from its first value.
             response = lfilter(numerators[i], denominators[i], command - command[0])
             residuals[i] += float(np.var(position - response)) * position.size
     total_squares = sum(float(np.var(position)) * position.size for _, _, position in moving)
@@ -228,7 +232,8 @@ def _compute_transfer_functions(
     zeros, ones = np.zeros_like(frequency), np.ones_like(frequency)
     denominators = np.stack([ones, -(z1 + z2).real, (z1 * z2).real], axis=1)
     first = 1.0 - ((p2 * z1 - p1 * z2) / (p2 - p1)).real  # (2) after one step
-    # The gain at rest is 1, so the coefficients of both polynomials have the same sum.
+    # Under a constant command the position reaches it (gain 1 at z = 1), so the coefficients of
+    # both polynomials have the same sum.
     second = denominators.sum(axis=1) - first
     return np.stack([zeros, first, second], axis=1), denominators
 

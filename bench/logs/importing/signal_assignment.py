@@ -262,6 +262,7 @@ def assign_velocities(
     """
     columns = [c for c in logs.columns if column_guessing.guess_role(c) == "velocity"]
     assignments = signals.place_columns(columns)
+    # Columns whose joint is only known by their number.
     columns_by_order = {
         joint.name: column
         for column, joint, placement in assignments
@@ -270,7 +271,8 @@ def assign_velocities(
     candidates_by_kind: dict[tuple[str, ...], list[_Candidate]] = {}
     for own_column, joint, own_placement in assignments:
         column, placement = own_column, own_placement
-        # Columns assigned by their numbers follow the order of the positions.
+        # Columns assigned by their numbers follow the order of the positions: if those were
+        # exchanged, the joint gets the velocity column with the number of its position column.
         if placement is Placement.MODEL_ORDER and joint.name in exchanged:
             column = columns_by_order.get(exchanged[joint.name], own_column)
             placement = Placement.POSITIONS
@@ -367,7 +369,9 @@ def _assign_kind(
     for column, joint, placement, position, comparison, confirmed_unit in candidates:
         name, source = f"qd.{joint.name}", position.column.name
         stated_unit = column.unit if is_convertible(column.unit, f"{joint.unit}/s") else ""
+        # A joint that hardly moves has no comparison, and gets the unit of the others.
         unit = confirmed_unit or (usual_unit if comparison is None else "")
+        # The first reason to leave the column out decides.
         if name in signals.channels:
             reason = f"{name} is {signals.channels[name].column.name} already"
         elif not unit:
@@ -719,6 +723,7 @@ class ColumnAssigner:
                 candidates = [c for c in candidates if column_guessing.is_measured(c.column)]
             if len(candidates) != 1:
                 continue
+            # One candidate is left.
             ((column, joint, placement),) = candidates
             origin = ", measured, because no column has its command"
             self._assign_force(column, joint, name, placement, origin)
@@ -749,11 +754,13 @@ class ColumnAssigner:
         actuator has a command.
         """
         signals = self._signals
+        # Actuators without a command column.
         undriven_actuators = [
             a for a in signals.robot.actuators if f"u.{a.name}" not in signals.inputs
         ]
         if not undriven_actuators and (signals.inputs or signals.robot.actuators):
             return
+        # First the case of a model without actuators and inputs, then that of missing commands.
         text = "the model has no input, so no actuator drives it"
         table = f"force.{signals.joints[0].name}"
         if undriven_actuators:

@@ -78,7 +78,8 @@ def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
         # interval compensates for it: the duration of the run limits the number of lost samples.
         expected_count = int(steps.sum() / np.median(steps))
         run_lost_count = min(int(lost.counts.sum()), max(expected_count - steps.size, 0))
-        # The jitter of all intervals adds up to this error of the duration, in samples.
+        # The jitters of n intervals add up to an error of the duration by sqrt(n) of one, in
+        # samples. Fewer lost samples than several times this error are not significant.
         if run_lost_count < SIGNIFICANCE_SIGMAS * lost.jitter * steps.size**0.5:
             run_lost_count = 0
         lost_count += run_lost_count
@@ -234,7 +235,8 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
         expected_seconds = _compute_free_motion_time(values, accelerations[:, column], min_spread)
         if expected_seconds is None:
             continue
-        # Shortest time after which the values differ by as much as their spread.
+        # Shortest time after which the recorded values differ by as much as their spread (standard
+        # deviation).
         recorded_seconds = interval * _estimate_lag(values)
         ratio = recorded_seconds / expected_seconds
         expected_text = f"as {kind.name} would within {expected_seconds:.2g} s"
@@ -498,7 +500,8 @@ def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Est
     grid = np.arange(t[0], t[-1], step)
     positions = np.interp(grid, t[is_recorded], y[is_recorded])
     past_command_means = _average_over_intervals(np.interp(grid, t, u))
-    # Samples for which all intervals lie within the run.
+    # Samples for which all intervals lie within the run. The last edge is the longest time before a
+    # sample, and the first one, which is negative, lies after it.
     fitted_part = slice(LAG_BIN_EDGES[-1], len(grid) + LAG_BIN_EDGES[0])
     time = (grid - grid.mean())[fitted_part]
     positions, past_command_means = positions[fitted_part], past_command_means[fitted_part]
@@ -533,6 +536,7 @@ def _fit_drift(
         The drift and its standard error; None if nothing is orthogonal.
     """
     basis, _ = np.linalg.qr(np.column_stack([regressors, velocity]))
+    # Response of the position to the drift, of which the orthogonal part is kept.
     delay_response = -time * velocity
     delay_response = delay_response - basis @ (basis.T @ delay_response)
     response_power = float(delay_response @ delay_response)

@@ -50,6 +50,7 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
             for contact in data.contact[: data.ncon]:
                 bodies = [model.body(int(model.geom_bodyid[g])).name for g in contact.geom]
                 pair = min(bodies), max(bodies)
+                # The distance of a contact is negative if the geoms overlap.
                 deepest[pair] = max(deepest.get(pair, 0.0), -float(contact.dist))
             for pair, depth in deepest.items():
                 if depth > MIN_OVERLAP_METRES:
@@ -96,7 +97,9 @@ def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iter
         run = next(runs_without_state, None)
         if run is None:
             continue
-        if names.count(run.name) > 1:  # two parts of a single run
+        # A single run is divided in two parts with the same name, of which the second one is held
+        # out; its first state cannot be stated.
+        if names.count(run.name) > 1:
             missing_text = (
                 f"where {joint} is when the last third of a single run begins; record another"
             )

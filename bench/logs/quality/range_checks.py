@@ -66,6 +66,7 @@ def _check_joint_range(recording: Recording, joint: Joint) -> Iterator[Anomaly]:
         joint: joint of its model; its range is in rad or m.
     """
     column = f"q.{joint.name}"
+    # Size of the smaller unit (degree or millimetre) in the unit of the range, and its name.
     unit, (smaller_unit, smaller_unit_name) = joint.unit, _SMALLER_UNITS[joint.unit]
     for run in recording.runs:
         positions = run.channels.get(column)

@@ -85,7 +85,8 @@ def check_servos(recording: Recording, kind: type[Simulator]) -> Iterator[Anomal
         for command, _ in servo_signals
         for _, position in servo_signals
     }
-    # Slopes around 57.3, the number of degrees in a radian.
+    # Slopes around 57.3, the number of degrees in a radian: one signal is in degrees. A slope of
+    # that size means the position, its inverse the command.
     min_degree_slope, max_degree_slope = DEGREE_SLOPE_RANGE
     for command, position in servo_signals:
         slope, correlation = regressions[command, position]
@@ -116,6 +117,7 @@ def _check_exchanged(
     """
     for i, (command, position) in enumerate(servo_signals):
         for other_command, other_position in servo_signals[i + 1 :]:
+            # Each position against the other's command, and against its own.
             crossed = regressions[command, other_position], regressions[other_command, position]
             own = regressions[command, position], regressions[other_command, other_position]
             if (

@@ -97,6 +97,7 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
             if not values:
                 continue
             extreme = max(float(np.nanmax(run_values)) for run_values in values)
+            # A change by a few quantisation steps is no jump.
             min_jump = CLIPPING_STEP_THRESHOLD * estimate_noise(signals).step
             saturated_count = sum(
                 _count_saturated_samples(run_values, extreme, min_jump) for run_values in values
@@ -221,6 +222,7 @@ def _count_saturated_samples(values: Array, extreme: float, min_jump: float) -> 
         min_jump: smallest change into or out of a saturated stretch, in the unit of the signal.
     """
     is_extreme = np.concatenate([[False], values == extreme, [False]]).astype(np.int8)
+    # Changes of the mask alternate: begin and end of each stretch.
     edges = np.flatnonzero(np.diff(is_extreme))
     # Each stretch is values[begin:end]. With one more value in front, values[begin - 1] is
     # padded_values[begin], and values[end] is padded_values[end + 1].

@@ -193,12 +193,14 @@ class VelocityComparison(NamedTuple):
         """
         slope, dv = self.slope, self.velocity_changes
         difference = slope * self.velocity_integrals - self.position_changes
+        # The difference is proportional to slope * T * dv, so this is the denominator of T.
         power = slope * float(dv @ dv)
         if power == 0:
             return None
         # T by least squares: the difference is about -slope T dv.
         seconds = -float(difference @ dv) / power
         residual = difference + slope * seconds * dv
+        # Standard error of T: that of the regressor slope * dv, whose square sum is slope * power.
         error = float(np.sqrt(residual @ residual / max(residual.size - 1, 1) / abs(slope * power)))
         if abs(seconds) < max(
             DELAY_THRESHOLD_INTERVALS * self.interval, SIGNIFICANCE_SIGMAS * error

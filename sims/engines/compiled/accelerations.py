@@ -53,7 +53,10 @@ def evaluate_forces(block: Block) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.rows[NAME]` is the register of an input or an output, the
+            first one if there are several. `block.flags` states what the system has, such as dry
+            friction.
     """
     d = block.flags[DIMENSIONS]
     rows = block.rows
@@ -88,7 +91,10 @@ def begin_step(block: Block) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.rows[NAME]` is the register of an input or an output, the
+            first one if there are several. `block.flags` states what the system has, such as dry
+            friction.
     """
     if block.flags[HAS_FRICTION] == 0:
         compute_frictionless_acceleration(block, K1)
@@ -139,7 +145,9 @@ def begin_step_1d(block: Block) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.rows[NAME]` is the register of an input or
+            an output, the first one if there are several. `block.out[k]` is the register of the
+            force on coordinate k.
     """
     a = block.a
     r = block.r
@@ -183,7 +191,8 @@ def compute_acceleration(block: Block, row_of_result: int, friction_row: int) ->
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.flags` states what the system has, such as
+            dry friction.
         row_of_result: first row of `block.a` for the accelerations, one of K2, K3 and K4.
         friction_row: first row of `block.a` for the dry friction, one of F2, F3 and F4.
     """
@@ -211,9 +220,11 @@ def compute_acceleration_1d(block: Block, row_of_result: int, friction_row: int)
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
-        row_of_result: first row of the accelerations.
-        friction_row: first row of dry friction.
+            among them, in `block.r[REGISTER, i]`. `block.rows[NAME]` is the register of an input or
+            an output, the first one if there are several. `block.out[k]` is the register of the
+            force on coordinate k.
+        row_of_result: first row of the accelerations in `block.a`, one of K1 to K4.
+        friction_row: first row of the dry friction in `block.a`, one of F1 to F4.
     """
     a = block.a
     r = block.r
@@ -237,9 +248,11 @@ def compute_further_coordinates(block: Block, row_of_result: int, friction_row: 
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
-        row_of_result: first row of the accelerations.
-        friction_row: first row of dry friction.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.out[k]` is the register of the force on coordinate k.
+            `block.flags` states what the system has, such as dry friction.
+        row_of_result: first row of the accelerations in `block.a`, one of K1 to K4.
+        friction_row: first row of the dry friction in `block.a`, one of F1 to F4.
     """
     a = block.a
     for k in range(1, block.flags[DIMENSIONS]):
@@ -261,10 +274,13 @@ def compute_acceleration_nd(block: Block, i: int, row_of_result: int, friction_r
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.rows[NAME]` is the register of an input or an output, the
+            first one if there are several. `block.flags` states what the system has, such as dry
+            friction.
         i: index of the slot, the column of the batch element.
-        row_of_result: first row of the accelerations.
-        friction_row: first row of dry friction.
+        row_of_result: first row of the accelerations in `block.a`, one of K1 to K4.
+        friction_row: first row of the dry friction in `block.a`, one of F1 to F4.
     """
     a = block.a
     friction_coordinate_count = block.flags[FRICTION_COORDINATE_COUNT]
@@ -308,7 +324,8 @@ def compute_acceleration_without_friction(
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.flags` states what the system has, such as dry friction.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the accelerations, which contains the forces before.
         friction_row: first row of dry friction.
@@ -329,7 +346,9 @@ def compute_force_without_friction(block: Block, i: int, row_of_result: int) -> 
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.out[k]` is the register of the force on coordinate k.
+            `block.flags` states what the system has, such as dry friction.
         i: index of the slot, the column of the batch element.
         row_of_result: first row of the forces.
     """
@@ -351,7 +370,8 @@ def compute_frictionless_acceleration(block: Block, row_of_result: int) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.out[k]` is the register of the force on
+            coordinate k. `block.flags` states what the system has, such as dry friction.
         row_of_result: first row of the accelerations.
     """
     a = block.a

@@ -62,7 +62,8 @@ def integrate_batch(
     COMPILED.load()
     all_elements = _make_arrays(batch, [], max_phase, patience)
     count, record_count, _ = all_elements.records.shape
-    # A record is position, velocity and acceleration, one after the other.
+    # A record is position, velocity and acceleration, one after the other. This is a view of the
+    # records, which the machine code fills in.
     trajectories = all_elements.records.reshape(count, record_count, 3, -1)
     for elements, effects in _group_by_effects(batch):
         arrays = all_elements._replace(order=elements.astype(np.int64))
@@ -157,12 +158,13 @@ def _make_arrays(
     )
     ones = np.ones(count)
     longest_steps = steps.max(axis=1, initial=0.0) * ones
+    # Minimum number of parts of a step in which the phase of these oscillations is small enough.
     divisions = np.ceil(fastest * longest_steps / max_phase)
     inertia = compute_own_inertia(system, batch.theta, batch.constants, hidden)
-    record_count = steps.shape[1] // batch.steps_per_sample + 1
+    record_count = steps.shape[1] // batch.steps_per_sample + 1  # with the initial state
     return BatchArrays(
         order=np.arange(count),
-        parameters=np.zeros((0, 0)),
+        parameters=np.zeros((0, 0)),  # set later for each group of elements
         mass=_to_column(inertia, count),
         x=np.ascontiguousarray(x, dtype=np.float64),
         v=np.ascontiguousarray(v, dtype=np.float64),

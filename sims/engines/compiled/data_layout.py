@@ -278,7 +278,7 @@ def check_block(block: Block) -> None:
     sizes = measure_arrays(BLOCK_SHAPES, block)
     d, elements, steps, rows = sizes["d"], sizes["l"], sizes["t"], block.rows
     # Numbers of registers for positions, inputs and parameters. They are consecutive groups, and
-    # `rows` has the first register of each.
+    # `rows` has the first register of each, so that a group ends where the next one begins.
     register_counts = rows[IN_V] - rows[IN_X], rows[IN_P] - rows[IN_U], rows[IN_E] - rows[IN_P]
     record_sizes = steps // block.steps_per_record + 1, 3 * d
     if (

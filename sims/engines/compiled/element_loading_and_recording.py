@@ -43,7 +43,10 @@ def load_element(block: Block, i: int, order_index: int) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.rows[NAME]` is the register of an input or an output, the
+            first one if there are several. `block.flags` states what the system has, such as dry
+            friction.
         i: index of the slot, the column of the batch element.
         order_index: index of the element in `block.order`.
     """
@@ -51,7 +54,7 @@ def load_element(block: Block, i: int, order_index: int) -> None:
     n = block.n
     d = block.flags[DIMENSIONS]
     element = block.order[order_index]
-    for row in range(FIRST_VECTOR):
+    for row in range(FIRST_VECTOR):  # the rows with a single number
         a[row, i] = 0.0
     n[:, i] = 0
     n[ORDER_INDEX, i] = order_index
@@ -66,6 +69,7 @@ def load_element(block: Block, i: int, order_index: int) -> None:
     a[EVENT_DELAY, i] = np.inf
     a[MASS, i] = block.mass[element]
     a[FLOOR_LEVEL, i] = block.ground[FLOOR, element]
+    # Steps that are the same for all elements are stored in a single row.
     a[REMAINING_TIME, i] = block.steps[element if block.steps.shape[0] > 1 else 0, 0]
     first = block.rows[IN_P]
     for p in range(block.parameters.shape[1]):
@@ -82,11 +86,13 @@ def set_inputs(block: Block, i: int) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.rows[NAME]` is the register of an input or
+            an output, the first one if there are several.
         i: index of the slot, the column of the batch element.
     """
     first = block.rows[IN_U]
     step = min(block.n[STEP_INDEX, i], block.steps.shape[1] - 1)
+    # Inputs that are the same for all elements are stored in a single row.
     row = block.n[ELEMENT, i] if block.inputs.shape[1] > 1 else 0
     for u in range(block.inputs.shape[0]):
         block.r[first + u, i] = block.inputs[u, row, step]
@@ -118,6 +124,7 @@ def record_and_check_remaining(block: Block, i: int) -> bool:
             record_state(block, i, step // block.steps_per_record)
         if step == block.steps.shape[1]:
             return False
+    # Steps of zero length do not count, as in the number of planned steps.
     if block.limits[PATIENCE] < np.inf and a[REMAINING_TIME, i] > 0.0:
         a[STEP_COUNT, i] += 1.0
         if a[STEP_COUNT, i] > block.limits[PATIENCE] * block.planned_counts[n[ELEMENT, i]]:
@@ -133,7 +140,8 @@ def record_state(block: Block, i: int, record: int) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.flags` states what the system has, such as dry friction.
         i: index of the slot, the column of the batch element.
         record: index of the record.
     """

@@ -90,13 +90,15 @@ def step_elements(block: Block) -> None:
     delay others. In every turn of the loop, all slots compute their forces, record their states at
     sample times, and try one step; slots of finished elements get the next ones. A tried step is
     accepted if it contains no event (such as an impact) and its forces are smooth enough; otherwise
-    it is shortened and repeated in the next turn.
+    it is shortened and repeated in the next turn. Elements are loaded in the sequence of
+    `block.order`, which lists their indices.
 
     Args:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.flags` states what the system has, such as
+            dry friction.
     """
     # Elements that move fast get shorter steps.
     choose_step_divisions(block)
@@ -124,6 +126,7 @@ def step_elements(block: Block) -> None:
         evaluate_forces(block)
         begin_step(block)
         for i in range(block.w):
+            # An idle slot takes no step in this turn: it is unused, or its element has finished.
             block.n[IS_IDLE, i] = block.n[ORDER_INDEX, i] < 0
             is_used = block.n[ORDER_INDEX, i] >= 0
             # A finished element gives its slot to the next one, which begins in the next turn.
@@ -167,7 +170,10 @@ def try_step(block: Block) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.rows[NAME]` is the register of an input or an output, the
+            first one if there are several. `block.flags` states what the system has, such as dry
+            friction.
     """
     a = block.a
     r = block.r
@@ -176,6 +182,7 @@ def try_step(block: Block) -> None:
     for stage in range(1, 4):
         # Time of the stage as a share of the step, and the acceleration of the previous stage.
         share = 0.5 if stage < 3 else 1.0
+        # Each of the vectors K1 to K4, and F1 to F4 of dry friction, has MAX_COORDINATES rows.
         acceleration_row = K1 + (stage - 1) * MAX_COORDINATES
         for i in range(block.w):
             r[t, i] = a[T, i] + share * a[H, i]
@@ -216,7 +223,8 @@ def accept_or_retry(block: Block, i: int) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.flags` states what the system has, such as dry friction.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
@@ -261,6 +269,7 @@ def next_step(block: Block, i: int) -> None:
     """
     a = block.a
     n = block.n
+    # Steps that are the same for all elements are stored in a single row.
     row = n[ELEMENT, i] if block.steps.shape[0] > 1 else 0
     step = n[STEP_INDEX, i] + 1
     n[STEP_INDEX, i] = step

@@ -107,7 +107,8 @@ def detect_and_schedule_event(block: Block, i: int) -> bool:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.flags` states what the system has, such as
+            dry friction.
         i: index of the slot, the column of the batch element.
     """
     a = block.a
@@ -140,7 +141,8 @@ def detect_and_schedule_event(block: Block, i: int) -> bool:
             # Pulling force minus friction limit at both ends of the step.
             excess_before = a[EXCESS_BEFORE, i]
             excess_after = a[EXCESS_AFTER, i]
-            # A scheduled break-away is checked again with a tolerance.
+            # A scheduled break-away is checked again with a tolerance, a share of the step, within
+            # which the excess is nearly linear.
             max_excess = 0.0
             if awaits_break_away:
                 max_excess = BREAK_AWAY_TIME_TOLERANCE * (excess_after - excess_before)
@@ -209,7 +211,8 @@ def handle_standstill(block: Block, i: int) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.flags` states what the system has, such as dry friction.
         i: index of the slot, the column of the batch element.
     """
     a = block.a

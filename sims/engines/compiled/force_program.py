@@ -90,9 +90,12 @@ def get_force_program(
     for example because a user's effect contains an ``if``, the program calls these functions with
     NumPy, which is slower; the reason is printed once.
 
+    Traced programs are cached, because they are the same for equal types of system and effects.
+
     Args:
         batch: whole batch.
-        elements: (n,) indices of the elements.
+        elements: (n,) indices of the elements; the trace is tested at the initial state of the
+            first one.
         effects: effects that act on them.
     """
     system = batch.system
@@ -106,7 +109,8 @@ def get_force_program(
         if key in _traced_forces:
             return _traced_forces[key]
         program = _find_program(batch, elements[:1], names, effects)
-        # Registers of the outputs: force and limit of dry friction; restitution and friction.
+        # Registers of the outputs: force and limit of dry friction; restitution and friction. The
+        # registers of the force are passed on their own, because it is a vector.
         (_, limit), impact = program.outputs
         rows = [*program.function.input_ends[:-1], *np.concatenate([limit, *impact])]
         flags = _make_flags(system, names, effects)
@@ -188,12 +192,17 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
             mu: (L, 1) friction coefficient of the ground without effects.
             speed: (L, 1) impact speed, m/s.
         """
+        # The columns of the constants come first; those that follow are coefficients of effects.
         theta, *columns = np.split(parameters, np.cumsum(sizes)[:-1], axis=1)
         constants = dict(zip(names.constants, columns, strict=False))
+        # (L, K) becomes (K, L, 1), the shape that effects expect.
         coefficients = [c.T[:, :, None] for c in columns[len(constants) :]]
         acting = list(zip(effects, coefficients, strict=True))
         inputs = {name: u[:, k, None] for k, name in enumerate(names.inputs)}
         moment = StateSnapshot(system, theta, constants, t, x[:, :own], v[:, :own], inputs)
+
+        # The inertia M', which only the forces of hidden states need.
+        inertia = 1.0 if d == own else compute_own_inertia(system, theta, constants, acting)
 
         def evaluate_forces() -> tuple[Any, Any]:
             """Return the generalised force (L, d), and the limit (L, 1) of dry friction.
@@ -221,10 +230,8 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
                 force = np.concatenate([force, *hidden_forces], axis=1)
             return force, 0.0 if limit is None else limit
 
-        inertia = 1.0 if d == own else compute_own_inertia(system, theta, constants, acting)
-
         def evaluate_impact() -> tuple[Any, Any]:
-            """Return restitution and friction coefficient."""
+            """Return restitution and friction coefficient of an impact, each (L, 1)."""
             restitution, friction = e, mu
             for effect, c in acting:
                 if isinstance(effect, Contact):
@@ -234,8 +241,11 @@ def _make_function(system: System, names: _InputNames, effects: Sequence[Effect]
 
         return evaluate_forces, evaluate_impact
 
+    # Size of each argument of `bind`, and how often its values change: with each evaluation of the
+    # forces, each batch element, or each impact.
     groups = [(size, PER_EVALUATION) for size in (1, d, d, len(names.inputs))]
     groups += [(sum(sizes), PER_ELEMENT), *[(1, PER_IMPACT)] * 3]
+    # Sizes of the outputs: force and friction limit; restitution and friction coefficient.
     return ArrayFunction(groups, ((d, 1), (1, 1)), bind)
 
 
@@ -248,7 +258,7 @@ def compute_own_inertia(
     """Return the inertia (L, 1) that remains for the system's own coordinates.
 
     It is M' = M (1 - sum of the shares) (1): an elastic element, for example, moves a share of the
-    inertia M behind it, to its hidden coordinate.
+    inertia M behind it, to its hidden coordinate. `effect.behind` returns this share, from 0 to 1.
 
     Args:
         system: the system.
@@ -273,13 +283,15 @@ def _make_samples(
 ) -> list[Array]:
     """Return the n inputs (n, 1) of a program at an element's initial state, and at a shifted one.
 
-    Hidden states are zero at the first. A traced program is compared with NumPy at both.
+    Hidden states are zero at the first. A traced program is compared with NumPy at both. The last
+    axis is that of the slots, of which there is one.
 
     Args:
         batch: whole batch.
         first: (1,) index of the element.
         effects: effects of the program, a part of those of the batch.
     """
+    # (1, K) for each effect of the program.
     coefficients = [c[:, first, 0].T for active, c in batch.effects if active in effects]
     constants = [values[first] for values in batch.constants.values()]
     parameters = np.concatenate([batch.theta[first], *constants, *coefficients], axis=1)[0]

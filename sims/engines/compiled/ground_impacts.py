@@ -82,7 +82,8 @@ def resolve_initial_ground_contact(block: Block) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.flags` states what the system has, such as
+            dry friction.
     """
     a = block.a
     n = block.n
@@ -124,17 +125,19 @@ def is_newly_loaded(block: Block, i: int) -> bool:
 def handle_impact(block: Block, i: int, k: int) -> None:
     """Apply an impact with the ground, which the element has nearly reached.
 
-    First the element moves exactly to the ground: with its height d above the ground, the rate r of
-    d and the upward acceleration a, the impact is -d / r (1 + d a / (2 r^2)) seconds away (5).
+    First the element moves exactly to the ground: with its height h above the ground, the rate r of
+    h and the upward acceleration a, the impact is -h / r (1 + h a / (2 r^2)) seconds away (5).
     Then its velocity becomes that of the rebound.
 
     Args:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.flags` states what the system has, such as
+            dry friction.
         i: index of the slot, the column of the batch element.
-        k: first row of the acceleration before the impact.
+        k: first row of the acceleration before the impact: K1 at the beginning of a step, K4 at
+            its end.
     """
     a = block.a
     d = block.flags[DIMENSIONS]
@@ -177,7 +180,9 @@ def compute_rebound_velocity(block: Block, i: int, upward_acceleration: float) -
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.rows[NAME]` is the register of an input or
+            an output, the first one if there are several. `block.flags` states what the system has,
+            such as dry friction.
         i: index of the slot, the column of the batch element.
         upward_acceleration: upward acceleration before the impact; negative under gravity.
     """
@@ -188,7 +193,8 @@ def compute_rebound_velocity(block: Block, i: int, upward_acceleration: float) -
     element = block.n[ELEMENT, i]
     rate_row = V + d - 1
     speed = abs(a[rate_row, i])
-    # The program runs on all slots up to this one; the results of the others are not used.
+    # The program always runs from slot 0 on, so that all slots up to this one are filled; the
+    # results of the others are not used.
     width = i + 1
     for s in range(width):
         r[rows[IN_E], s] = block.ground[RESTITUTION, element]
@@ -209,7 +215,7 @@ def compute_rebound_velocity(block: Block, i: int, upward_acceleration: float) -
         square = 0.0
         for j in range(d - 1):
             square += a[V + j, i] * a[V + j, i]
-        # The root of a square would be rounded.
+        # With a single tangential coordinate, the root of the square would be rounded.
         tangential_speed = abs(a[V, i]) if d == 2 else np.sqrt(square)
         share = 1.0 - lost_speed / (tangential_speed if tangential_speed > 0.0 else 1.0)
         # The ground leaves at least this share, such as where the body begins to roll.

@@ -246,7 +246,7 @@ def run_rare_instruction(op: int, r: FloatArray, o: int, a: int, b: int, w: int)
     """
     for i in range(w):
         x = r[a, i]
-        y = r[b, i]
+        y = r[b, i]  # not used by operations of one argument
         if op == POWER:
             z = np.power(x, y)
         elif op == LESS:

@@ -55,13 +55,18 @@ def make_intrinsics(numba: Any) -> dict[str, Any]:
     """Return the compiled versions of the functions of this module, by name.
 
     An intrinsic is a function whose LLVM code is generated here. The compiled code uses them to
-    read arrays of other libraries, and to call Python through a C callback.
+    read arrays of other libraries, and to call Python through a C callback. numba calls such a
+    function during compilation, with the types of the arguments; the function returns the signature
+    and a generator of the LLVM code.
+
+    Args:
+        numba: the module numba.
     """
     from llvmlite import ir
     from numba.np.unsafe.ndarray import to_fixed_tuple
 
     types = numba.types
-    word = ir.IntType(64)
+    word = ir.IntType(64)  # integer of 64 bits, which also holds an address
 
     def make_pointer_function(kind: Any, target: Any) -> Any:
         """Make a numba function that converts an integer address to a pointer.

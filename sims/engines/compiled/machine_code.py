@@ -113,7 +113,7 @@ def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., Non
             raise CodeNotLoadableError(f"{symbol} is missing")
     engine.add_object_file(llvm.ObjectFileRef.from_data(code.body))
     engine.finalize_object()
-    _owners.append((engine, abort_function))
+    _owners.append((engine, abort_function))  # without a reference, the code would be released
     kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers)
     return kind(engine.get_function_address(code.name))
 

@@ -82,7 +82,7 @@ def main(module: str, entry: str, pointers: int, constants: Mapping[str, int]) -
 
     Args:
         module: name of the module.
-        entry: name of the function, or of an `CompiledFunctions` object, which generates it.
+        entry: name of the function, or of a `CompiledFunctions` object, which generates it.
         pointers: number of the function's arguments, which are pointers to integers.
         constants: numbers that replace global constants of the module, by name.
     """

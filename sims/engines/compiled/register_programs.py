@@ -147,6 +147,10 @@ class PreparedProgram:
 
         Compiled code cannot raise the exceptions of functions that it calls; they are raised after
         each part.
+
+        Returns:
+            One function for each part: values that depend on parameters alone, values of an
+            evaluation, and values of an impact.
         """
         runners = [
             make_instruction_runner(self.code, first, last, self.r)
@@ -178,6 +182,7 @@ class PreparedProgram:
             width: number of slots in use.
         """
         # NumPy computes the values of part 0 again in each evaluation, so that part 0 does nothing.
+        # A function without impacts has no outputs for part 2.
         if not 0 < part <= len(self.program.outputs):
             return
         outputs = self.program.outputs[part - 1]
@@ -185,6 +190,8 @@ class PreparedProgram:
             try:
                 with np.errstate(all="ignore"):
                     if width not in self._evaluators:
+                        # The inputs (width, n) of each group are views, so that the evaluators are
+                        # made once and read the present values of the registers.
                         ends = self.program.function.input_ends
                         views = [self.r[a:b, :width].T for a, b in pairwise(ends)]
                         self._evaluators[width] = self.program.function.bind(*views)
@@ -344,10 +351,11 @@ class TracedPrograms:
         """
         kind = type(one.source)
         if kind not in self._is_traceable:
-            self._is_traceable[kind] = False
+            self._is_traceable[kind] = False  # unless all checks below succeed
             if getattr(one.source, "is_traceable", True):
                 # A user's code may raise any error when called with traced arrays.
                 try:
+                    # The program is cached by class, but attributes differ between instances.
                     if getattr(one.source, "__dict__", None):
                         raise NotTraceableError(
                             "it has instance attributes, which a trace cannot follow"

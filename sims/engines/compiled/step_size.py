@@ -117,7 +117,8 @@ def divide_steps(block: Block) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.flags` states what the system has, such as
+            dry friction.
     """
     for element in block.order:
         division = block.divisions[element]
@@ -175,11 +176,13 @@ def set_inputs_at(block: Block, instant: int) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. `block.rows[NAME]` is the register of an input or
+            an output, the first one if there are several.
         instant: index of the selected step.
     """
     first = block.rows[IN_U]
     for i in range(block.w):
+        # Inputs that are the same for all elements are stored in a single row.
         row = block.n[ELEMENT, i] if block.inputs.shape[1] > 1 else 0
         for u in range(block.inputs.shape[0]):
             block.r[first + u, i] = block.inputs[u, row, block.n[SAMPLED_STEP + instant, i]]
@@ -196,7 +199,10 @@ def compute_stiffness_and_damping(block: Block, at_rest: bool) -> None:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.rows[NAME]` is the register of an input or an output, the
+            first one if there are several. `block.out[k]` is the register of the force on
+            coordinate k. `block.flags` states what the system has, such as dry friction.
         at_rest: whether to evaluate at rest at zero instead of the initial state.
     """
     a = block.a
@@ -230,7 +236,8 @@ def update_max_slope(block: Block, k: int, register: int, row_of_result: int) ->
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.out[k]` is the register of the force on coordinate k.
         k: index of the coordinate.
         register: first register of the positions or velocities.
         row_of_result: MAX_ACCELERATION for positions, or MAX_FRICTION for velocities: rows that
@@ -239,7 +246,8 @@ def update_max_slope(block: Block, k: int, register: int, row_of_result: int) ->
     """
     a = block.a
     if row_of_result == MAX_FRICTION:
-        # Both velocities are on one side of rest: a discontinuity at rest is not a faster decay.
+        # Both velocities are on one side of rest: a discontinuity at rest is not a faster decay. So
+        # rows K1 get the forces at the first changed velocity.
         for i in range(block.w):
             block.r[register + k, i] += FINITE_DIFFERENCE_STEP
         run_part(block, FORCES)
@@ -288,12 +296,14 @@ def shorten_if_nonlinear(block: Block, i: int) -> bool:
     largest acceleration so far, and likewise for dry friction unless the element sticks. A step is
     not rejected if it is already very short or ends at a scheduled event. STEP_LIMIT, the longest
     allowed step, is reduced after a rejection, and doubles after an accepted step of that length.
+    The rows K1 to K4 hold the accelerations, F1 to F4 the dry friction at the same stages.
 
     Args:
         block: force program, simulations (elements) of a batch, and their buffers. Each of the
             `block.w` slots in use holds one element: slot i its numbers in `block.a[ROW, i]`, its
             integers in `block.n[ROW, i]`, and the registers of the force program, inputs and forces
-            among them, in `block.r[REGISTER, i]`.
+            among them, in `block.r[REGISTER, i]`. A vector has one row per coordinate: `X + k` is
+            that of coordinate k. `block.flags` states what the system has, such as dry friction.
         i: index of the slot, the column of the batch element.
     """
     a = block.a

@@ -153,7 +153,7 @@ def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
 
     Args:
         ball: Ball in the engine.
-        element: Batch element: initial state, steps, constants and effects.
+        element: Batch element: initial state, steps, constants and effects, in arrays of one row.
 
     Returns:
         Positions, velocities and accelerations (N, 3) in N recorded states; NaN if the integration
@@ -192,7 +192,7 @@ class BallRollout:
 
         Args:
             ball: Ball in the engine, with impacts at their exact time.
-            element: Initial state, constants, inputs and steps.
+            element: Initial state, constants, inputs and steps, in arrays of one row.
         """
         self._ball = ball
         self._forces = ElementForces(element, 1)
@@ -262,9 +262,9 @@ class BallRollout:
         if self.w is None:
             # The velocity half a step earlier: w = v - h/2 a.
             half_step = 0.5 * step
-            x, y, z = self.v
+            vx, vy, vz = self.v
             ax, ay, az = self.a
-            self.w = x - half_step * ax, y - half_step * ay, z - half_step * az
+            self.w = vx - half_step * ax, vy - half_step * ay, vz - half_step * az
             self._ball.set_state(self.x, self.w)
         return self.w
 
@@ -278,19 +278,19 @@ class BallRollout:
         """
         half_step = 0.5 * step
         wx, wy, wz = self._prepare_step(step)
-        x, y, z = self.v
+        vx, vy, vz = self.v
         ax, ay, az = self.a
         gx, gy, gz = self._gravity
         # (4); at rest the engine's contact balances any force that presses the ball on the ground.
-        lift = self.lift - gz if self.rests else (z + half_step * az - wz) / step - gz
-        force_x = (x + half_step * ax - wx) / step - gx
-        force_y = (y + half_step * ay - wy) / step - gy
+        lift = self.lift - gz if self.rests else (vz + half_step * az - wz) / step - gz
+        force_x = (vx + half_step * ax - wx) / step - gx
+        force_y = (vy + half_step * ay - wy) / step - gy
         self.x, self.w = self._ball.advance((force_x, force_y, lift))
         self.time += step
         wx, wy, wz = self.w
         # The acceleration at the end is evaluated at the velocity that (3) gives with the
         # acceleration at the beginning; then (3) is evaluated with the result.
-        self.v = 2.0 * wx - x, 2.0 * wy - y, 0.0 if self.rests else 2.0 * wz - z
+        self.v = 2.0 * wx - vx, 2.0 * wy - vy, 0.0 if self.rests else 2.0 * wz - vz
         self._update_acceleration()
         ax, ay, az = self.a
         self.v = (
@@ -301,11 +301,11 @@ class BallRollout:
 
     def _update_acceleration(self) -> None:
         """Evaluate the acceleration at the present state; at rest the vertical one is zero."""
-        x, y, z = self._gravity
-        if self._forces.acts:
-            x, y, z = self._forces.evaluate(self.time, self.x, self.v)
-        self.lift = z
-        self.a = x, y, 0.0 if self.rests else z
+        ax, ay, az = self._gravity
+        if self._forces.acts:  # forces per unit mass, with gravity
+            ax, ay, az = self._forces.evaluate(self.time, self.x, self.v)
+        self.lift = az
+        self.a = ax, ay, 0.0 if self.rests else az
 
     def _time_to_ground(self) -> float:
         """Return the seconds until the ball meets the ground with its present acceleration.
@@ -406,7 +406,7 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
 
     Args:
         ball: Ball in the engine, with the engine's own contact.
-        element: Batch element: initial state, steps, constants and effects.
+        element: Batch element: initial state, steps, constants and effects, in arrays of one row.
 
     Returns:
         Positions, velocities and accelerations (N, 3) in N recorded states; NaN if the integration
@@ -436,12 +436,14 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
     floor = float(element.system.floor(element.constants)[0, 0])
     ball.reset_world(element.plain_constants)
     x: Vector = element.x[0].tolist()
-    w: Vector = element.v[0].tolist()
+    w: Vector = element.v[0].tolist()  # velocity in the engine
+    # Restitution may depend on the impact speed; w[2] is negative while the ball falls.
     ball.set_contact_parameters(*forces.compute_impact(max(-w[2], 0.0)))
     ball.set_state(x, w)
     recorded_steps = set(element.recorded_steps.tolist())
     t = 0.0
     step = math.nan
+    # Nine numbers for each state: position, velocity and force of the effects.
     recorded_states = [(*x, *w, *compute_force(t, x, w))]
     for number, seconds in enumerate(element.steps[0].tolist(), start=1):
         if seconds != step:

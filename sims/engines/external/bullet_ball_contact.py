@@ -67,7 +67,14 @@ class _BulletMover:
         self._x = x
 
     def advance(self, force: Vector) -> BallState:
-        """Advance by one step with a force per unit mass at the ball's last known centre."""
+        """Advance by one step with a force per unit mass at the ball's last known centre.
+
+        Args:
+            force: force per unit mass in addition to gravity, m/s^2.
+
+        Returns:
+            Position (m) and Bullet's velocity (m/s) after the step.
+        """
         # Bullet expects the force in newtons and the point where it acts.
         p = bullet_world.import_pybullet()
         mass = self._mass

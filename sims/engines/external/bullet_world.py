@@ -34,6 +34,7 @@ def _discard_output() -> Iterator[None]:
     with contextlib.ExitStack() as undo:
         for stream in (1, 2):
             with contextlib.suppress(OSError):  # a process may lack this stream
+                # At the end, these steps are undone in reverse order.
                 saved_descriptor = os.dup(stream)
                 undo.callback(os.close, saved_descriptor)
                 undo.callback(os.dup2, saved_descriptor, stream)

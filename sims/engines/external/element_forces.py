@@ -82,7 +82,7 @@ class ElementForces:
         Args:
             step: Index of the step.
         """
-        has_changed = step == 0
+        has_changed = step == 0  # the first step has no previous one: all inputs are set
         for k, values in enumerate(self._input_values):
             if step == 0 or values[step] != values[step - 1]:
                 has_changed = True
@@ -109,7 +109,7 @@ class ElementForces:
         numbers[self._x_offset] = numbers[self._x_offset + 1] = x
         numbers[self._v_offset], numbers[self._v_offset + 1] = velocities
         self._run_moment()
-        force = self._force_offsets[0]
+        force = self._force_offsets[0]  # of the only coordinate, two numbers
         return numbers[force], numbers[force + 1]
 
     def evaluate(self, t: float, x: Vector, v: Vector) -> tuple[float, float, float]:
@@ -124,7 +124,8 @@ class ElementForces:
         """
         numbers = self._memory
         numbers[self._t_offset] = t
-        # There is one state, so that the three coordinates are in consecutive places.
+        # There is one state, so that registers of one number each follow each other: the three
+        # coordinates are in consecutive places.
         x_offset, v_offset = self._x_offset, self._v_offset
         numbers[x_offset], numbers[x_offset + 1], numbers[x_offset + 2] = x
         vx, vy, vz = v

@@ -95,6 +95,8 @@ def integrate_batch(
     trajectories = Trajectories(
         *(np.full((len(batch.theta), count, batch.x.shape[1]), np.nan) for _ in range(3))
     )
+    # Index of each element, what its rollout needs, and the recorded state that each of the `count`
+    # rows of its result repeats.
     work: list[tuple[int, ElementWork, Indices]] = []
     for element_index in range(len(batch.theta)):
         # Elements of one run are adjacent and have the same steps.
@@ -183,6 +185,7 @@ def _make_element(
     forces = [(e, c) for e, c in effects if isinstance(e, Force | Friction | Contact)]
     # The parameters of the program: those of the system, its constants, then coefficients.
     numbers = [element.theta[0], *(value[0] for value in element.constants.values())]
+    # Steps whose inputs are kept: those with a length.
     # An element without any step of positive length still has an input at its single time.
     input_steps = moving if moving.size else slice(1)
     changes = {

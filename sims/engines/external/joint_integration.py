@@ -193,11 +193,12 @@ def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
 
     Args:
         joint: the body of the engine.
-        element: batch element: initial state, steps, constants and effects.
+        element: batch element: initial state, steps, constants and effects, in arrays of one row.
 
     Returns:
         The trajectory; NaN if it diverges, or if the inertia is not positive.
     """
+    # `limit` of the forces is that of dry friction; `w` is the engine's velocity, `v` the true one.
     joint.reset_world()
     # Moment of inertia in kg m^2, or mass in kg.
     inertia = float(element.system.mass(element.theta, element.constants)[0, 0])
@@ -222,7 +223,8 @@ def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
         )  # (1)
         if h != step:
             joint.set_step(h, inertia)
-            w = 2.0 * v - start  # then the applied force equals the true force
+            # The velocity half a step before: w = v - h/2 f / M by (1), so that (4) is f itself.
+            w = 2.0 * v - start
             joint.set_state(x, w)
             step = h
         x, w = joint.advance((start - w) * inertia / h)  # (4), (2)

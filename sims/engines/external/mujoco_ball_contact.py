@@ -224,6 +224,7 @@ class MujocoSoftBall(MujocoMover):
         if friction and self._data.nefc:  # the contact is active
             vx, vy, _ = self._w.tolist()
             slip = math.hypot(vx, vy)
+            # Without friction, the only contact has one constraint force, the normal one.
             normal = float(self._data.efc_force[0])
             # Deceleration divided by the speed, 1/s: friction must not do more than stop the slip
             # within the step.

@@ -29,6 +29,8 @@ def name_numbered_columns(
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Name the numbered columns of a table by the columns that hold their names.
 
+    Shapes: T rows.
+
     ROS logs, for example, have columns ``name[0]``, ``name[1]``, ... with names of joints and
     ``position[0]``, ``position[1]``, ... with numbers. The column of the joint elbow is then
     ``position.elbow``. Names are looked up in each row, because some loggers change their order.
@@ -75,6 +77,8 @@ def name_list_entries(
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Name the entries of lists by a column that holds a list of names in each row.
 
+    Shapes: T rows.
+
     A cell of names is ``['base', 'elbow']``. Each column of lists with as many entries is divided
     into columns such as ``position.elbow``; the names are looked up in each row.
 
@@ -94,6 +98,7 @@ def name_list_entries(
         # The first row must have names, and all others as many.
         if not name_lists or not name_lists[0] or len(set(map(len, name_lists))) > 1:
             continue
+        # (k, T) names, for k entries in T rows.
         names = [list(entry_names) for entry_names in zip(*name_lists, strict=True)]
         for name, values in columns.items():
             if values.ndim == 2 and values.shape[1] == len(names):
@@ -108,6 +113,8 @@ def name_array_entries(
     columns: Mapping[str, Array], names: Mapping[str, Sequence[str]]
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Name the entries of arrays by an array of names of the same length.
+
+    Shapes: T rows.
 
     Each array (T, k) with as many columns as there are names is divided into columns such as
     ``position.elbow``.
@@ -172,6 +179,7 @@ def _sort_by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) ->
         there are far more different texts than columns, which are then not names.
     """
     distinct_names = list(dict.fromkeys(name for column in names for name in column if name))
+    # More than four different texts per column are notes or values, and not names.
     if not distinct_names or len(distinct_names) > 4 * len(names):
         return {}
     table = np.array(names, dtype=object).T

@@ -22,6 +22,8 @@ from sims.recording.log_formats.log_columns import MAX_COLUMNS, convert_read_err
 def read_numeric_columns(table: Any) -> tuple[dict[str, Array], list[str]]:
     """Read the numeric columns of a pyarrow table.
 
+    Shapes: T rows.
+
     Args:
         table: Table of pyarrow.
 
@@ -61,6 +63,8 @@ def _is_list(kind: Any) -> bool:
 
 def _convert_to_numbers(column: Any) -> Array | None:
     """Return the numbers of a column as floats; None if it holds no numbers.
+
+    Shapes: T rows.
 
     Time stamps become numbers in their own unit, and booleans 0 and 1.
 
@@ -140,6 +144,8 @@ def list_run_paths(path: Path) -> list[Path]:
 
 def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list[str]]]:
     """Read the datasets of a group and of the groups in it.
+
+    Shapes: T rows.
 
     Args:
         path: HDF5 file.

@@ -79,6 +79,8 @@ def list_episode_files(dataset: Path, episode: int) -> list[Path]:
 def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[str]]:
     """Read an episode of a dataset: its rows in all files that have some, without images.
 
+    Shapes: T rows.
+
     A column of lists whose entries the dataset names becomes a column for each entry, such as
     ``observation.state.elbow_flex.pos``.
 
@@ -106,6 +108,7 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
             ]
             row_filter = [(EPISODE_COLUMN, "==", episode)]
             parts.append(parquet.read_table(file, columns=column_names, filters=row_filter))
+            # Joined here, so that the error for a file with other columns names that file.
             table = pyarrow.concat_tables(parts)
     numeric_columns, texts = read_numeric_columns(table)
     columns: dict[str, Array] = {}

@@ -44,6 +44,8 @@ class LogFile:
     def get_column(self, name: str) -> Array:
         """Return one column (T,), or one entry of a column of lists, such as ``position[2]``.
 
+        Shapes: T rows.
+
         Args:
             name: Name as a description or a user wrote it; case does not count.
 

@@ -146,7 +146,8 @@ def _read_topic(
         InputError: The topic has no messages, or its messages have no numbers.
     """
     columns = ros_bags.read_topic(bag, topic, columns_to_read)
-    # The time stamps are always a column.
+    # The time stamps are always a column. If wanted columns are missing, the caller reads the topic
+    # again with all columns.
     has_only_stamps = len(columns) < 2 and not columns_to_read
     if has_only_stamps or not columns[TIME_COLUMN].size:
         raise InputError(f"{path}: expected messages with numbers, found none")
@@ -189,6 +190,8 @@ def _read_npz(path: Path) -> LogFile:
 
 def _make_array_log(path: Path, columns: dict[str, Array], texts: dict[str, list[str]]) -> LogFile:
     """Make a log of the arrays of a file, such as an .npz archive.
+
+    Shapes: T rows.
 
     Args:
         path: the file.

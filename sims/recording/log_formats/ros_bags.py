@@ -188,6 +188,8 @@ class MessageTable:
     def columns(self) -> dict[str, Array]:
         """Return all columns (T,) by name, ordered by time stamp, and empty the table.
 
+        Shapes: T messages.
+
         A number that a message lacks is NaN. The time stamps are those of the message headers, or
         if some message has none, the times of writing.
         """
@@ -377,6 +379,8 @@ def list_topics(bag: Path) -> list[str]:
 
 def read_topic(bag: Path, topic: str, wanted_names: Collection[str] = ()) -> dict[str, Array]:
     """Read the numbers of a topic, ordered by time stamp.
+
+    Shapes: T messages.
 
     Args:
         bag: Bag file or folder.

@@ -94,7 +94,7 @@ def find_layout(path: Path) -> Layout:
     )
     rows = {n: _split_line(text, separator) for n, text in text_by_line.items()}
     width = _find_row_width([row for n, row in rows.items() if n not in comment_lines])
-    columns = _find_numeric_columns(rows.values(), width)
+    columns = _find_numeric_columns(rows.values(), width)  # positions of the columns of numbers
     first_data_line = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
     lines_above = [n for n in rows if n < first_data_line] if first_data_line else list(rows)
     units_by_column: dict[int, str] = {}
@@ -102,7 +102,7 @@ def find_layout(path: Path) -> Layout:
         # Missing cells at the end of the row are empty.
         units_by_column = _parse_units([*rows[lines_above[-1]], *[""] * width], columns)
     if units_by_column:
-        lines_above.pop()
+        lines_above.pop()  # the row of units is not the header
     for n in reversed(lines_above):
         names = _parse_header(text_by_line[n], separator, width, columns)
         if names is not None:
@@ -423,6 +423,8 @@ def _make_unique_names(layout: Layout) -> list[str]:
 def _read_cells(layout: Layout) -> list[Any]:
     """Read the cells of each column as text, without comments and lines before the first row.
 
+    Shapes: T rows.
+
     The file is read in the detected encoding, or as Windows-1252. Columns at the end that have no
     name and are empty throughout are dropped.
 
@@ -520,12 +522,13 @@ def _find_uneven_row(layout: Layout) -> InputError | None:
                 count -= 1
             if count == layout.width:
                 continue
-            if last_line > line:
+            if last_line > line:  # a quoted cell contains a line end
                 return InputError(
                     f"{layout.path}, row {line}: a quotation mark opens a cell that ends in row "
                     f"{last_line}; close or delete it"
                 )
             reference = f"as in the header, row {layout.header}" if layout.header else "as above"
+            # No row follows: the logger was probably stopped while it wrote this one.
             is_last = all(later <= line for later, *_ in _iterate_rows(layout))
             if count < layout.width and is_last:
                 remedy = "the log is truncated there: delete this row"
@@ -536,6 +539,7 @@ def _find_uneven_row(layout: Layout) -> InputError | None:
                 f"found {count}; {remedy}"
             )
     except csv.Error:  # such as a cell of more than 131,072 characters
+        # `line` is that of the last row that could be read.
         return InputError(
             f"{layout.path}, row {line + 1}: expected cells of numbers or short texts, "
             "found a cell that is too long; is a quotation mark not closed?"
@@ -593,6 +597,8 @@ class _TextColumn:
     def __init__(self, layout: Layout, name: str, cells: Any) -> None:
         """Find out whether commas in a column are decimal commas or thousands separators.
 
+        Shapes: T rows.
+
         If most of the sampled cells with a comma are not numbers, the column holds lists or
         text, and its commas have no meaning (`has_commas` is False). Otherwise they are decimal
         commas, thousands separators, or ambiguous if neither is set. `series` has the cells
@@ -631,6 +637,8 @@ class _TextColumn:
 
     def convert_to_numbers(self, file_has_decimal_commas: bool) -> Array | None:
         """Convert the cells to numbers.
+
+        Shapes: T rows.
 
         The first cell that is not empty decides the kind: Boolean values, lists, dates or numbers.
         Empty cells, and marks such as "nan", are missing numbers (NaN). If more than half of the
@@ -707,6 +715,8 @@ class _TextColumn:
 
     def _convert_dates(self) -> Array | None:
         """Convert times such as ``2026-11-26 17:24:01.123`` to (T,) seconds since 1970.
+
+        Shapes: T rows.
 
         Empty cells become NaN.
 

@@ -103,6 +103,8 @@ _KNOWN_NAMES = {
 def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
     """Read the tensors of a PyTorch file, and its lists of texts.
 
+    Shapes: T samples.
+
     Returns:
         Tensors of one or two dimensions by name, (T,) or (T, k), and the texts of each other entry,
         empty where it holds something else.
@@ -125,6 +127,8 @@ def _read_tensors(
     path: Path, archive: zipfile.ZipFile
 ) -> tuple[dict[str, Array], dict[str, list[str]]]:
     """Read all tensors of one or two dimensions in an archive, and its lists of texts.
+
+    Shapes: T samples.
 
     Args:
         path: path of the file, for messages.

@@ -108,6 +108,7 @@ def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
     import mujoco
 
     model = robot.compiled
+    # MuJoCo's numbers of both types; an exact filter advances by the exact solution of the lag.
     filter_types, exact_type = filters(), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
     activation_filters_of_robot = []
     for actuator in robot.actuators:

@@ -173,6 +173,7 @@ def compute_inputs_over_steps(
     has_sample = run.find_steps_with_sample(step)
     applied_inputs: dict[str, Array] = {}
     for name, signal in commands.items():
+        # Commands before the run, as bytes; empty if they are not known.
         earlier = scenario.before[name].tobytes() if name in scenario.before else b""
         # Everything on which the applied input depends.
         key = (

@@ -274,7 +274,7 @@ def settle_contacts(
                 reused[layout] = _differentiate(model, state, contacts, residual, keys)
             jacobian = reused[layout]
             step = _solve(jacobian, residual, weights @ (state - measured), weights)
-            # 3. Step length.
+            # 3. Step length. The cost is the sum (2) of contacts and distance from the measurement.
             for _ in range(MAX_HALVINGS):
                 new_contacts = model.evaluate(state + step)
                 offset = weights @ (state + step - measured)
@@ -328,10 +328,9 @@ def _differentiate(
 def _solve(jacobian: Array, residual: Array, offset: Array, weights: Array) -> Array:
     """Return the Gauss-Newton step (2 D,) for the sum of squares |offset|^2 + |residual|^2.
 
-    The state has the positions and velocities of D joints.
-
-    It is a linear least-squares problem in the weighted step y = W dz: the offset becomes offset +
-    y, and the residual becomes residual + J W^-1 y with the Jacobian J.
+    With a step dz of the state z, the positions and velocities of D joints, the offset becomes
+    offset + y with the weighted step y = W dz, and the residual becomes residual + J W^-1 y with
+    the Jacobian J. The sum is smallest for the solution y of a linear least-squares problem.
 
     Args:
         jacobian: (m, 2 D) derivatives of the residual.
@@ -351,10 +350,9 @@ def _compute_residual(
 ) -> npt.NDArray[np.float64]:
     """Return the residual (m,) of contact equilibrium, divided by its tolerances.
 
-    It has m components, two or more for each contact.
-
-    A closed contact must have no normal velocity and no acceleration of its point. An open one must
-    have no normal velocity and the depth `FIRST_DEPTH`, so that it closes.
+    A closed contact must have no normal velocity and no acceleration of its point: two components
+    without friction, four with it. An open one must have no normal velocity and the depth
+    `FIRST_DEPTH`, so that it closes: two components.
 
     Args:
         contacts: contacts at the state; one that does not exist there is taken from `reference`.
@@ -377,8 +375,9 @@ def _compute_residual(
 def _compute_cost(contacts: dict[_Key, _Contact], keys: list[_Key]) -> float:
     """Return the sum of squares of the residual of contact equilibrium.
 
-    Open contacts cost at least their free fall, so that closing them decreases the sum. If a
-    contact does not exist, the sum is infinite.
+    The square of the acceleration of free fall, times the number of open contacts, is added, so
+    that closing a contact decreases the sum. If a contact does not exist at the state, the sum is
+    infinite.
 
     Args:
         contacts: contacts at a state.
@@ -386,7 +385,7 @@ def _compute_cost(contacts: dict[_Key, _Contact], keys: list[_Key]) -> float:
     """
     if not all(key in contacts for key in keys):
         return float("inf")
-    # The same contacts decide here what is closed.
+    # The contacts at this state itself decide which of them are closed.
     residual = _compute_residual(contacts, contacts, keys)
     open_count = sum(not contacts[key].is_closed for key in keys)
     # An open contact falls with the acceleration of gravity, 9.81 m/s^2.

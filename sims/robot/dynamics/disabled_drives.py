@@ -77,10 +77,8 @@ class ForceRanges:
     def write(self, off: Mask) -> None:
         """Switch actuators of the first n batch elements off where `off` (n, K) is true.
 
-        There are K actuators.
-
-        All their other actuators are switched on: they get the force ranges that they had when this
-        object was created.
+        All other ones of their K actuators are switched on: they get the force ranges that they had
+        when this object was created.
         """
         limit_flags, force_ranges = self._values_when_on
         n = len(off)

@@ -158,7 +158,8 @@ class StepForces:
         def make_samples() -> Iterator[Array]:
             """Yield values (inputs, L) of all inputs of the function: random motions and states.
 
-            Times, step, stiffness and coefficients are not random.
+            Each yield is a test at other values, in L batch elements. Times, step, stiffness and
+            coefficients are not random.
             """
             rng = np.random.default_rng(0)
             shape = function.input_ends[-1], len(self._stiffness)
@@ -243,6 +244,7 @@ class StepForces:
         registers[self._interval_group] = self.step if k else 0.5 * self.step
         if self._working is not None:
             registers[self._stiffness_group] = (self._stiffness * self._working[:, k]).T
+        # The initial hidden states depend on the state and the inputs of the first step.
         if k == 0:
             self.begin(joint_states)
         self._run()
@@ -279,6 +281,9 @@ def _make_function(
     def bind(t: Any, middle: Any, step: Any, interval: Any, *values: Any) -> tuple[Evaluator]:
         """Return the function that evaluates all effects on given registers.
 
+        Each group of registers is an array with one row for each batch element, and one column for
+        each number.
+
         Args:
             t: time at the beginning of the step.
             middle: time at its middle.
@@ -295,9 +300,8 @@ def _make_function(
         def evaluate() -> tuple[Any, Any, Any]:
             """Return forces and friction limits (L, D) at the middle of a step, and hidden states.
 
-            There are L batch elements and D joints.
-
-            The H hidden states (L, 2 H) are those after the interval.
+            There are L batch elements and D joints. The H hidden states (L, 2 H), a position and a
+            rate each, are those after the interval; without any, the result is an array (1, 0).
             """
             x, v = predict_midpoint(at.x, at.v, at.a, step)
             midpoint = make_snapshot(
@@ -326,4 +330,5 @@ def _make_function(
     sizes = [1] * 4 + [joints] * len(JointStates._fields) + [len(input_names), joints]
     groups = [(size, PER_EVALUATION) for size in sizes]
     groups += [(len(effects.coefficients), PER_ELEMENT), (states, PER_EVALUATION)]
+    # There is one evaluator (`evaluate`), and these are the sizes of its three outputs.
     return ArrayFunction(groups, ((joints, joints, states),), bind)

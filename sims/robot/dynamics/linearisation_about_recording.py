@@ -225,6 +225,7 @@ class MeasuredLinear(RunLinearisation):
             return None
         self._readings = dict(self._nearby._readings)
         inputs = self._simulator.compute_controls(self._run_batch, steps)
+        # Controls, forces and switches are those of this model; all else is that of `nearby`.
         return replace(
             motion,
             compute_loads=lambda: motion.carried,
@@ -303,6 +304,12 @@ class MeasuredLinear(RunLinearisation):
         interval; the responses G_i and the defects d_i (the difference between the motion and the
         model's own steps) are composed in the same way. H is computed by finite differences: each
         state component is changed at all samples at once.
+
+        Returns:
+            For T samples of C channels, Z state components, E forces and nu controls: A (T - 1, Z,
+            Z), d (T - 1, Z), G (T - 1, Z, E), responses to forces and controls (T - 1, Z, E + nu),
+            H (T, C, Z), h (T, C), and standard deviations (T - 1, Z) of state jumps at force limits
+            of servos.
         """
         tangent, state_size = self._tangent, self._tangent.state_size
         point_of_step, quotients = tangent.point_of_step, tangent.quotients
@@ -459,8 +466,10 @@ class MeasuredLinear(RunLinearisation):
     ) -> tuple[SingleArray, SingleArray]:
         """Compute what candidate effects add to the states (3) and to the readings (4).
 
-        A force is replaced by its mean over the interval between two samples. Sensor effects are
-        applied to predicted readings: a gain applied to the recorded reading would contain the
+        In the model from sample i to i + 1, an effect adds a change b to the deviation δ[i+1] of
+        the state (3), and a direct change ψ to the readings y[i], without a change of the motion
+        (4). A force is replaced by its mean over the interval between two samples. Sensor effects
+        are applied to predicted readings: a gain applied to the recorded reading would contain the
         noise that it has to explain.
 
         Args:
@@ -521,10 +530,8 @@ class MeasuredLinear(RunLinearisation):
     def _input_responses(self) -> Array:
         """State changes (T - 1, Z, E + nu) at the end of each interval between T samples.
 
-        A state has Z components.
-
-        They are per unit of one of E generalised forces or nu controls that is constant over the
-        interval.
+        They are the changes of the Z state components per unit of each of the E generalised forces
+        and nu controls, which is constant over the interval.
         """
         quotients = self._tangent.quotients
         input_matrices = np.concatenate([quotients.forces, quotients.controls], axis=2)

@@ -128,7 +128,8 @@ class RunLinearisation:
         fields = {name: values[0] for name, values in simulated.fields.items()}
         dofs = mujoco_batch.all_joints.velocities
         # Forces (2, S, D) on both sides of the transmissions: those of the actuators, and those of
-        # gravity and motion. Other integrators than Runge-Kutta leave those of a step's beginning.
+        # gravity and motion. After a step, MuJoCo's data has the forces of its beginning, or with
+        # Runge-Kutta those of its end, which are converted to those of its middle.
         carried = np.stack([fields[name][:, dofs] for name in TRANSMISSION_FORCE_FIELDS])
         if forces_are_at_step_end(mujoco_batch.model):
             carried = compute_midpoint_loads(carried, inputs.controls[0])
@@ -302,6 +303,7 @@ class RunLinearisation:
                 is_handled_otherwise = isinstance(part, (Sensor, Input)) or is_series_effect(part)
                 if not is_handled_otherwise and part_c.any():
                     changes += self._list_perturbations(owner, part, part_c)
+            # Their owners are indices in `added`, which are replaced by those among these effects.
             input_changes = control_changes.get(effect_index, ())
             changes += [change._replace(owner=owner) for change in input_changes]
         return changes, sensors
@@ -452,11 +454,12 @@ class RunLinearisation:
         position_count = self._motion.x.shape[1]
         run_effects = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._run_batch.acting)
         columns = []
+        # Steps (T,) at whose beginnings the samples are; None if a sample is within a step.
         sample_steps = find_sample_steps(simulator.time_step, self._times, instants)
         for channel in simulator.channels:
             acting = _select_sensor_effects(channel.name, run_effects, sensors)
             # If all samples are at beginnings of steps, only these steps are needed. A sensor
-            # effect that shifts time or filters needs all steps.
+            # effect that shifts time or filters needs all steps, which None stands for.
             needed_steps = sample_steps if preserves_time(acting) else None
             rows: slice | NDArray[np.intp] = (
                 slice(instants) if needed_steps is None else needed_steps

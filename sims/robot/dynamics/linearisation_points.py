@@ -135,7 +135,7 @@ class LinearisationPoints:
         self._outputs = tuple(outputs)
         self._joints = joints
         self._joint_of_output = np.array(tuple(drives) or (-1,) * len(self._outputs), dtype=np.intp)
-        # Forces (n, D) of effects in drives, which a sensor of drive forces shows.
+        # Forces (n, D) of effects in drives, which a sensor of drive forces shows; none so far.
         self._drive_effect_forces = np.zeros((0, 0))
         self._floating = mujoco_batch.floating
         # Addresses of the velocities of all joints and floating bodies.
@@ -160,7 +160,8 @@ class LinearisationPoints:
         ]
         self.hidden_state_effects = range(len(self._hidden_states))
         self._next_hidden_states: list[HiddenState] = []
-        # The state to which a batch is set before points are placed in it.
+        # The state to which a batch is set before points are placed in it. Stage 0 resets it
+        # without an evaluation of the dynamics.
         mujoco_batch.batch.reset(stage=0)
         self._reset_state = mujoco_batch.batch.state.copy()
         # At first, all steps are points, since contacts may change at any of them.
@@ -171,9 +172,10 @@ class LinearisationPoints:
     def _find_changed_contacts(self) -> Mask:
         """Return at which of S steps the contacts with the ground have changed, as a mask (S,).
 
-        They show in the derivatives of a step by the position of a floating body. The contacts
-        count as changed if any derivative differs from that at the last change by more than
-        `MAX_RELATIVE_CHANGE` times the typical largest derivative of a step.
+        They show in the derivatives of a step by the position of a floating body, since only a
+        contact makes its motion depend strongly on its place. The contacts count as changed if any
+        derivative differs from that at the last change by more than `MAX_RELATIVE_CHANGE` times
+        the typical largest derivative of a step. It is called while all steps are points.
         """
         # States (S, Z) after a step from each of the S steps, and their derivatives by x, y and z
         # of each floating body, which slide joints represent.
@@ -243,8 +245,8 @@ class LinearisationPoints:
         Args:
             moved: index and size of the displacement by its quantity: ``{"q": (2, 1e-6)}`` moves
                 joint 2. The quantities are those of `_place_points`. Nothing moves if empty.
-            acting: effects whose elements are in the model.
-            steps: number of steps, for a batch with shorter ones.
+            acting: active effects; the model has the elements that they add, such as a joint.
+            steps: number of steps to make; more than one for a batch with shorter steps.
 
         Returns:
             States (N, Z) of Z components after the step, and readings (N, O) of the O outputs. A
@@ -293,7 +295,7 @@ class LinearisationPoints:
         """Compute accelerations and readings at the state of each of N points, without a step.
 
         Args:
-            acting: effects whose elements are in the model.
+            acting: active effects; the model has the elements that they add, such as a joint.
             extra_forces: (N, E) additional forces on the E velocities of joints and floating
                 bodies; none by default.
             moved: index and size of a displacement by its quantity: ``{"q": (2, 1e-6)}`` moves
@@ -395,6 +397,7 @@ class LinearisationPoints:
             point_count = steps.size
             if ranges is not None:
                 ranges.write(motion.off[steps])
+            # All quantities that are not set below, also those of the earlier points.
             batch.state[:] = self._reset_state
             if at_centres:
                 x, v = (values[begin : begin + point_count] for values in self._interval_centres)
@@ -709,16 +712,18 @@ def _choose_points(
         Steps of the N points (N,), and for each of the S steps the index of its point (S,).
     """
     steps = len(motion.controls)
+    # Steps (S,) at which the count begins again; the first step is always one.
     changes = np.ones(steps, dtype=bool)
     changes[1:] = (np.diff(motion.controls, axis=0) != 0).any(axis=1)
-    # A new point begins when a piecewise constant command changes. A command that changes in almost
-    # every step is as smooth as the motion and needs no extra points.
+    # A new point begins when a piecewise constant command changes. A command that changes more
+    # often than there are regular points is as smooth as the motion, and needs no extra points.
     if changes.mean() > 1.0 / spacing:
         changes[1:] = False
     changes[1:] |= (motion.off[1:] != motion.off[:-1]).any(axis=1)
     if contact_changes is not None:
         changes |= contact_changes
     step_numbers = np.arange(steps)
+    # Number (S,) of the last change at or before each step.
     last_change = np.maximum.accumulate(np.where(changes, step_numbers, 0))
     # Whether a step is the first of those for which a point stands.
     is_first = (step_numbers - last_change) % spacing == 0

@@ -209,6 +209,7 @@ class MujocoBatch:
             # Collision detection without possible contacts takes a third of a step of one joint.
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.drives = find_drive_sensors(model, robot)
+        # All elements are simulated by one thread.
         self.batch: Any = batch.Batch(model, count, 1)
         field_names = {
             field

@@ -308,6 +308,7 @@ class CallbackContexts:
             friction = mujoco_batch.fields["dof_frictionloss"]
             dofs = self._dofs[joint_indices]
             friction[batch_indices, dofs] = np.maximum(friction[batch_indices, dofs], MIN_FRICTION)
+            # Number of constraints of dry friction of each batch element.
             friction_rows = (friction > 0).sum(axis=1).tolist()
         else:
             friction_rows = [0] * len(losses)

@@ -108,11 +108,11 @@ def apply_effects_to_readings(
         active_elements = np.flatnonzero(is_active(c))
         # The step lengths of the signal are zero: only filters need them.
         signal = Signal(
-            readings[active_elements],
-            np.zeros_like(readings[active_elements]),
-            readings[active_elements, :1],
-            stamps[active_elements],
-            clock,
+            values=readings[active_elements],
+            steps=np.zeros_like(readings[active_elements]),
+            start=readings[active_elements, :1],
+            times=stamps[active_elements],
+            clock=clock,
         )
         readings[active_elements] = effect.read(c[:, active_elements], signal)
     return readings

@@ -225,7 +225,8 @@ def write_series_element(
         fields: model fields of the batch elements, changed in place.
         robot: robot of `add_series_joints`.
         place: name of the joint of the drive.
-        element: numbers (L,) of the element.
+        element: numbers (L,) of the element: stiffness, damping ratio, gap in m or rad, and the
+            drive's share of the joint's inertia.
     """
     second = robot.joint(find_series_joint(robot, place))
     inertia = robot.series[second.name]
@@ -406,7 +407,8 @@ def compute_rest_positions(
         half_gap = fields["jnt_range"][:n, second.id, 1]
         in_gap = half_gap * np.clip(load / (UNLOADED_FORCE_SHARE * inertia), -1.0, 1.0)
         has_gap = is_compliant | (spring_stiffness <= 0)
-        # The tiny divisor is never used; it avoids a division by zero where there is no spring.
+        # The tiny divisor only avoids a division by zero where there is no spring; `np.where` does
+        # not use this quotient.
         deflection = np.where(stiffness > 0, load / np.maximum(stiffness, 1e-300), 0.0)
         positions.append(deflection + np.where(has_gap, in_gap, 0.0))
     return positions

@@ -88,6 +88,10 @@ def compute_difference_quotients(
             E is the number of velocities, of joints and of floating bodies.
         get_base_step: function that returns the states (N, Z) after an unperturbed step from each
             point, and the readings (N, O).
+
+    Returns:
+        Derivatives of the state after a step by the Z state components (N, Z, Z), the forces
+        (N, Z, E) and the controls (N, Z, nu); and those of the readings, (N, O, Z) and so on.
     """
     # 1. Displacements as quantity, index and size. The quantities are q position, v velocity,
     # a activation, w hidden state of an effect, p and r displacement and velocity of floating
@@ -117,6 +121,7 @@ def compute_difference_quotients(
     else:
         evaluate = partial(points.step_displaced, acting=points.acting)
         unchanged_results, unchanged_readings = get_base_step()
+    # Derivatives of results and of readings, for each of the three groups of displacements.
     quotients: list[tuple[Array, Array]] = []
     for group in displacements.values():
         derivatives = np.zeros((*unchanged_results.shape, len(group)))

@@ -78,7 +78,7 @@ def step_with_forces(
         """Evaluate the effects at the predicted middle of step k, and add their forces to it."""
         ctrl[:n] = controls[:, k]
         if k == 0:
-            # Later joint states are those of the preceding step.
+            # Before other steps, MuJoCo's data has the joint states after the preceding step.
             mujoco_batch.batch.forward(mujoco_batch.get_element_ids(n))
         force, limit = step_forces.compute(k, predictor.read_joint_states(changes[:, k]))
         all_forces[:, k, dofs] += force

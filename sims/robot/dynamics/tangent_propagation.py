@@ -155,6 +155,7 @@ class TangentModel:
             Equivalent forces (N, E) on the E velocities of joints and floating bodies, and direct
             changes (N, O) of the O readings at unchanged states, both divided by `change`.
         """
+        # A contact reacts to the force M da, so that it would not change the acceleration by da.
         if self._points.has_contacts and not self._points.steps_joints_by_runge_kutta:
             return self._perturb_numbers_at_contacts(acting, change, mujoco_batch)
         # With these forces the unchanged model has its mean accelerations over a step.
@@ -294,6 +295,7 @@ class TangentModel:
         quotients = self.quotients
         state_size = quotients.forces.shape[1]
         steps = self._step_count
+        # Changes of forces and controls (S, E + nu, n), and direct changes of readings (S, O, n).
         inputs, readings = self.sum_inputs_and_readings(changes, count)
         # States, forces and controls of each step are stacked, so that a step is one matrix product
         # with [A, B, C]. Its result is the state part of the next step.
@@ -341,7 +343,8 @@ class TangentModel:
         force_count, control_count = quotients.forces.shape[2], quotients.controls.shape[2]
         reading_count = self._points.output_count
         # The series of one owner are contiguous in memory while they are added up. Forces come
-        # first, then controls: their means over the steps, and their values at the beginnings.
+        # first, then controls: their means over the steps, and their values at the beginnings. The
+        # latter are only used for readings; without any, no memory is taken for them.
         inputs = np.zeros((force_count + control_count, count, steps))
         instant_inputs = (
             np.zeros((control_count, count, steps)) if reading_count else inputs[force_count:]
@@ -354,6 +357,7 @@ class TangentModel:
                 inputs[change.joint, owner] += change.series
             if change.actuator >= 0 and change.series is not None:
                 inputs[force_count + change.actuator, owner] += change.series
+                # Values at the beginnings of the steps; the means stand for them if not stated.
                 instant = change.series if change.instant is None else change.instant
                 if reading_count:
                     instant_inputs[change.actuator, owner] += instant

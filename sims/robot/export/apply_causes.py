@@ -147,6 +147,7 @@ def apply_causes(
             continue
         applied_causes.append(cause)
         note = f"{cause.effect}: {remark}" if remark else _NOTES.get(cause.effect)
+        # Only an increased friction becomes stiff; a reduced one keeps the parameters of the file.
         if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
             note = _SOFT_FRICTION_NOTE
         if note and note not in notes:

@@ -106,6 +106,8 @@ def _format_default_element(
     if not _is_servo(values):
         types = {name: values[name] for name in ("gaintype", "biastype")}
         return "general", format_attributes(class_values | types)
+    # A servo's force is kp (control - position) - kv velocity: kp is the gain, and the third number
+    # of the bias is -kv.
     (stiffness, *_), (_, _, negative_damping, *_) = values["gainprm"], values["biasprm"]
     gains = {"kp": format_number(stiffness), "kv": format_number(-negative_damping)}
     # The element ``position`` implies all attributes of gain, bias and dynamics.
@@ -170,7 +172,7 @@ def render_model_using_class(
     if not any(element_tag.name in FILE_ELEMENTS for element_tag in document.walk()):
         for compiler in document.find_elements("compiler"):
             compiler.removed |= {"meshdir", "texturedir"}
-    # 3. Class.
+    # 3. Class, as the first element within the root, without comments before it.
     document.root.within.insert(
         0, ([], "<default>\n    " + text.replace("\n", "\n    ") + "\n  </default>")
     )

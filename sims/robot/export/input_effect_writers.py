@@ -46,15 +46,14 @@ class _Actuator:
         self.id = robot.actuator(place).id
         # Address of its first control.
         self.control = int(robot.compiled.actuator_ctrladr[self.id])
-        # Whether there is one control.
-        self.single = int(robot.compiled.actuator_ctrlnum[self.id]) == 1
+        self.has_one_control = int(robot.compiled.actuator_ctrlnum[self.id]) == 1
         self.fields = fields
         # Whether the input is the control itself, without activation dynamics such as a filter.
-        self.direct = self._get_integer_field("actuator_dyntype") == int(mujoco.mjtDyn.mjDYN_NONE)
-        # Whether the activation is limited.
-        self.clamped = bool(robot.compiled.actuator_actlimited[self.id])
-        # Whether the gain is constant.
-        self.fixed = self._get_integer_field("actuator_gaintype") == int(
+        self.has_no_dynamics = self._get_integer_field("actuator_dyntype") == int(
+            mujoco.mjtDyn.mjDYN_NONE
+        )
+        self.has_activation_limits = bool(robot.compiled.actuator_actlimited[self.id])
+        self.has_constant_gain = self._get_integer_field("actuator_gaintype") == int(
             mujoco.mjtGain.mjGAIN_FIXED
         )
         self.gain = fields["actuator_gainprm"][0, self.id]
@@ -69,12 +68,17 @@ class _Actuator:
         return int(self.fields[name][0, self.id])
 
     @property
-    def linear(self) -> bool:
+    def is_linear(self) -> bool:
         """True if the force is a gain times one control (possibly filtered) plus a bias."""
-        return self.single and (self.direct or self.filtered) and self.fixed and self.steady
+        return (
+            self.has_one_control
+            and (self.has_no_dynamics or self.is_filtered)
+            and self.has_constant_gain
+            and self.can_have_constant_bias
+        )
 
     @property
-    def steady(self) -> bool:
+    def can_have_constant_bias(self) -> bool:
         """True if the bias has a constant term, or can be given one."""
         import mujoco
 
@@ -82,12 +86,14 @@ class _Actuator:
         return self._get_integer_field("actuator_biastype") in kinds
 
     @property
-    def filtered(self) -> bool:
+    def is_filtered(self) -> bool:
         """True if a linear filter without limits precedes the actuator."""
         import mujoco
 
         kinds = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
-        return self._get_integer_field("actuator_dyntype") in kinds and not self.clamped
+        return (
+            self._get_integer_field("actuator_dyntype") in kinds and not self.has_activation_limits
+        )
 
     def shift(self, force: float) -> None:
         """Add a constant to the force of the actuator, before its gear, in N or N m.
@@ -142,7 +148,11 @@ def _write_input_gain(actuator: _Actuator, a: float) -> None:
         UnstatableCauseError: the force of the actuator is not proportional to a gain and one
             control, or 1 + a is not positive.
     """
-    can_scale = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
+    can_scale = (
+        actuator.has_one_control
+        and actuator.has_constant_gain
+        and (actuator.has_no_dynamics or actuator.is_filtered)
+    )
     if not can_scale:
         raise UnstatableCauseError(_NOT_LINEAR)
     if 1.0 + a < MIN_GAIN_FACTOR:
@@ -168,7 +178,7 @@ def _write_input_bias(actuator: _Actuator, b: float) -> None:
     Raises:
         UnstatableCauseError: the force of the actuator is not a gain times one control plus a bias.
     """
-    if not actuator.linear:
+    if not actuator.is_linear:
         raise UnstatableCauseError(_NOT_LINEAR)
     input_factor, _ = actuator.command  # 1 + a
     low, high = actuator.limits()
@@ -196,7 +206,7 @@ def _write_saturation(actuator: _Actuator, s: float) -> None:
     """
     if s <= 0:
         return
-    if not actuator.linear:
+    if not actuator.is_linear:
         raise UnstatableCauseError(_NOT_LINEAR)
     input_factor, b = actuator.command  # 1 + a, and b
     low, high = actuator.limits()
@@ -257,7 +267,7 @@ def _write_lag(actuator: _Actuator, lag: float) -> str | None:
 
     if lag <= 0:
         return None
-    if not (actuator.direct and actuator.fixed and actuator.single):
+    if not (actuator.has_no_dynamics and actuator.has_constant_gain and actuator.has_one_control):
         raise UnstatableCauseError("its actuator has dynamics already")
     # Fields have one batch element, 0. The first parameter of a filter is its time constant.
     actuator.fields["actuator_dyntype"][0, actuator.id] = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
@@ -290,8 +300,8 @@ def _write_constant_force(fields: Fields, robot: RobotModel, cause: FittedCause)
     Raises:
         UnstatableCauseError: the joint has neither a linear spring nor an actuator without limits.
     """
-    # 1. Spring. Its rest position also determines the rest length of tendons, except for those of
-    # coupled drives, which have no springs.
+    # 1. Spring. Its rest position also determines the rest length of tendons, so it cannot be
+    # changed in a model with tendons. Those of coupled drives have no springs and do not count.
     joint, (force,) = robot.joint(cause.place), cause.coefficients
     stiffness = fields["jnt_stiffness"][0, joint.id]
     has_tendons = robot.compiled.ntendon > len(robot.coupled)
@@ -311,7 +321,7 @@ def _write_constant_force(fields: Fields, robot: RobotModel, cause: FittedCause)
         actuator = _Actuator(fields, robot, driving.name)
         is_uncoupled = joint.name not in robot.coupled
         is_unlimited = driving.force is None and joint.effort is None
-        can_have_bias = actuator.single and actuator.steady
+        can_have_bias = actuator.has_one_control and actuator.can_have_constant_bias
         if driving.joint == joint.name and can_have_bias and is_unlimited and is_uncoupled:
             gear = robot.compiled.actuator_gear[actuator.id]
             if not fields["actuator_forcelimited"][0, actuator.id] and gear[0]:

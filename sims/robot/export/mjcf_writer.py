@@ -106,7 +106,8 @@ class MjcfEditor:
                     statement.element, AttributeStatement(statement.element)
                 )
                 # Attributes that were written without effect, or that another change has altered
-                # (in a round after the first), need their related attributes.
+                # (in a round after the first), need their related attributes: the statement is
+                # insisted on, so that `write` also writes these.
                 had_no_effect = bool(element_statement.values)
                 is_later_round = model is not self.original
                 element_statement.insisted = had_no_effect or is_later_round
@@ -135,6 +136,7 @@ class MjcfEditor:
         for statement in statements:
             writer.write(statement, self.applied.comments.get(statement.element, [KEPT_VALUE_NOTE]))
         heading = format_heading(self.robot.path, self.recording, self.applied.notes)
+        # A comment without an element, as the first content of the root.
         document.root.within.insert(0, ([heading], ""))
         return document.to_text()
 
@@ -211,10 +213,10 @@ class MjcfWriter:
         else:
             tag = self.tags[element]
             _add_comments(tag, comments)
-            values = self._format_joint(tag, statement)
             if element.kind == "actuator":
-                values = self._format_actuator(tag, statement)
-            tag.new |= values
+                tag.new |= self._format_actuator(tag, statement)
+            else:
+                tag.new |= self._format_joint(tag, statement)
 
     def _write_option(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
         """Write global options, such as gravity, into the last option element or a new one.

@@ -101,7 +101,7 @@ class UrdfWriter:
         self.joints = {tag.get_attribute("name"): tag for tag in top if tag.name == "joint"}
 
     def write(self, cause: FittedCause) -> None:
-        """Write a cause.
+        """Write a cause into the elements of the URDF, by the writer of its effect.
 
         Args:
             cause: Effect at a place with its fitted numbers.
@@ -131,6 +131,7 @@ class UrdfWriter:
             lines: lines for the comment at the top of the file.
         """
         comment = format_heading(self.robot.path, self.recording, lines)
+        # A comment without an element, as the first content of the root.
         self.markup.root.within.insert(0, ([comment], ""))
         return self.markup.to_text().decode()
 

@@ -128,7 +128,8 @@ def read_hull(model: Any, mesh: int, keeps_all_vertices: bool = False) -> Hull |
     )
     new_numbers = np.full(all_vertices.size, -1, dtype=np.int32)
     new_numbers[kept_vertices] = np.arange(kept_vertices.size)
-    # The two parts of the graph that have numbers of the mesh: its vertices and its faces.
+    # The two parts of the graph that have numbers of vertices in the mesh: the list of vertices and
+    # the faces. They get the new numbers.
     for vertex_entries in (
         slice(2 + vertex_count, 2 + 2 * vertex_count),
         slice(graph.size - 3 * face_count, graph.size),

@@ -157,11 +157,14 @@ class _LineTrackingTreeBuilder:
             skipped_lines: number of lines of the file above the parsed text; it is added to line
                 numbers.
         """
-        self.files, self.path, self.parser, self.above = files, path, parser, skipped_lines
-        self.open: list[Element] = []
+        self.files, self.path, self.parser = files, path, parser
+        self.skipped_lines = skipped_lines
+        # Elements whose end tag has not been reached; the last one is the parent of the next.
+        self.open_elements: list[Element] = []
         self.top: Element | None = None
         parser.StartElementHandler = self.begin
         parser.EndElementHandler = self.end
+        # An entity may stand for the content of another file, or for a huge text.
         parser.StartDoctypeDeclHandler = self.refuse
         parser.EntityDeclHandler = self.refuse
 
@@ -171,9 +174,9 @@ class _LineTrackingTreeBuilder:
         return self.top
 
     @property
-    def here(self) -> str:
+    def location(self) -> str:
         """File and line at the parser's position."""
-        return f"{self.path}:{self.parser.CurrentLineNumber + self.above}"
+        return f"{self.path}:{self.parser.CurrentLineNumber + self.skipped_lines}"
 
     def begin(self, name: str, attributes: dict[str, str]) -> None:
         """Add an element to the tree at its start tag, and store its file and line for messages.
@@ -183,20 +186,20 @@ class _LineTrackingTreeBuilder:
             attributes: its attributes.
         """
         element = Element(name, attributes)
-        self.files.places[element] = self.here
-        if self.open:
-            self.open[-1].append(element)
+        self.files.places[element] = self.location
+        if self.open_elements:
+            self.open_elements[-1].append(element)
         else:
             self.top = element
-        self.open.append(element)
-        if len(self.open) > MAX_ELEMENT_DEPTH:
+        self.open_elements.append(element)
+        if len(self.open_elements) > MAX_ELEMENT_DEPTH:
             raise self.files.make_error(element, f"elements more than {MAX_ELEMENT_DEPTH} deep")
 
     def end(self, _: str) -> None:
-        self.open.pop()
+        self.open_elements.pop()
 
     def refuse(self, *_: Any) -> None:
-        raise InputError(f"{self.here}: document types and entities are not read; remove them")
+        raise InputError(f"{self.location}: document types and entities are not read; remove them")
 
 
 def resolve_includes(files: ModelFileReader, root: Element) -> None:

@@ -301,6 +301,7 @@ def make_contact_place(robot: RobotModel, pair: str, pairs: tuple[str, ...]) -> 
         change_to_minimum = 2.0 * options.timestep / time_constant - 1.0
         min_softness_change = max(min_softness_change, min(change_to_minimum, 0.0))
     names = [get_geom_name(robot.compiled, geom) for geom in find_pair_geoms(robot, pair)]
+    # Size and inertia are those of a coordinate, which a contact does not have.
     return EffectPlace(
         name=pair,
         kind="contact",
@@ -353,6 +354,7 @@ def make_geom_place(robot: RobotModel, name: str) -> EffectPlace:
     if not has_radius(robot, geom):
         raise InputError(f"robot {robot.name}: geom {name} has no radius")
     radius = float(robot.compiled.geom_size[geom, 0])
+    # Size and inertia are those of a coordinate, which a geom does not have.
     return EffectPlace(
         name=name,
         kind="geom",
@@ -387,6 +389,7 @@ def _make_actuator_place(
     moved_joints = [place for place in joints if place.name in actuator.moves]
     size = max((place.size for place in moved_joints), default=STANDARD_GRAVITY * mass)
     inertia = max((place.inertia for place in moved_joints), default=mass)
+    # The caller replaces the signal, the unit, the stated numbers and the words.
     return EffectPlace(
         name=actuator.name,
         kind=actuator.motion,

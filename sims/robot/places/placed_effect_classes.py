@@ -120,6 +120,7 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
     # Attributes and methods that differ from those of the registered effect.
     changed: dict[str, Any] = {"coordinate": effect_place.coordinate, "signal": effect_place.signal}
     changed["says"] = f"{effect.says_at_place or effect.says} (at {effect_place.words})"
+    # At a contact, the pairs of geoms whose contacts get parameters of their own.
     changed["pairs"] = effect_place.pairs
     if issubclass(effect, Force):
         changed["force"] = _make_force_method(effect)
@@ -127,7 +128,8 @@ def make_placed_effect(effect: type[Effect], effect_place: EffectPlace) -> type[
         changed["limit"] = _make_limit_method(effect)
     elif issubclass(effect, HiddenStateEffect):
         changed["act"] = _make_act_method(effect)
-        # Coefficients: without those whose quantity the model file states.
+        # Coefficients, without those whose quantity the model file states. An effect between a
+        # drive and its load has other coefficients (`between`) where both sides are known, as here.
         declared_coefficients = effect.between or effect.coefficients
         coefficients = [
             _add_search_starts(_adapt_to_place(effect, c, effect_place))
@@ -165,7 +167,8 @@ def _make_force_method(effect: type[Force]) -> Callable[[Force, Array, StateSnap
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
         """Compute the forces (L, D), which are zero at all joints but that of the effect.
 
-        There are L batch elements and D joints.
+        There are L batch elements and D joints. The registered effect (`effect`) computes the
+        force of one joint.
 
         Args:
             self: the effect at its place.
@@ -226,7 +229,8 @@ def _make_shared_force_method(effect: type[Force], joints: Sequence[int]) -> Cal
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
         """Compute the forces (L, D) along all driven joints from the total load of the supply.
 
-        There are L batch elements and D joints.
+        There are L batch elements and D joints, of which `joints` are driven. The registered effect
+        (`effect`) computes the force of one joint.
 
         Args:
             self: the effect at its place.
@@ -257,7 +261,9 @@ def _make_limit_method(effect: type[Friction]) -> Callable[[Friction, Array, Sta
     """
 
     def limit(self: Friction, c: Array, moment: StateSnapshot) -> Array:
-        """Compute the friction limit (L, 1) of the effect's joint.
+        """Compute the friction limit (L, 1) of the effect's joint, in L batch elements.
+
+        The registered effect (`effect`) computes it from the state of this joint alone.
 
         Args:
             self: the effect at its place.
@@ -336,7 +342,8 @@ def _make_act_method(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Arr
     ) -> tuple[Array, Array]:
         """Compute the forces (L, D), zero at other joints, and the rate of the hidden state.
 
-        There are L batch elements and D joints.
+        There are L batch elements and D joints. The registered effect (`effect`) computes the
+        force (L, 1) of one joint, and the rate (L, 1).
 
         Args:
             self: the effect at its place.
@@ -462,7 +469,9 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
         c: coefficient as declared in the library.
         effect_place: place, with the values that the model file states there.
     """
-    # 1. Unit. The quantity `of` may be that of the input, of a servo's error, or of the reading.
+    # 1. Unit. A coefficient has one unit and one range for each kind of system (rotary, linear or
+    # point), of which the place is one. If `of` names the input, the error of a servo or the
+    # reading, such as ``input/s``, the unit is made from that of the place.
     system_kind = SYSTEM_KINDS.index(_KINDS[effect_place.kind])
     unit, (low, high) = c.units[system_kind], c.plausible[system_kind]
     lower_limit = c.least
@@ -499,11 +508,13 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
         lower_limit, highest = effect_place.limits[effect.name][c.name]
         upper_limit = highest if np.isfinite(highest) else None
         # The limits of a payload's offset lie outside the link, and its plausible range within it.
+        # Along an axis in which no offset can be observed, both ends are zero.
         if effect.name == "payload":
             begin, end = effect_place.limits["mass.offset"][c.name]
             low, high = (begin, end) if begin < end else (low, high)
         elif lower_limit < highest:
             low, high = max(low, lower_limit), min(high, highest)
+    # The place has one kind, so the unit and the range are repeated for all three.
     return replace(
         c, units=(unit,) * 3, plausible=((low, high),) * 3, least=lower_limit, most=upper_limit
     )
@@ -564,7 +575,8 @@ def _needs_no_engine_support(effect: type[Effect]) -> bool:
         # With coefficients `between`, it is declared as an element between drive and load. An
         # effect that moves a part of the joint's inertia itself overrides `behind`.
         return bool(effect.between) or effect.behind is HiddenStateEffect.behind
-    # A force that needs more than its own joint is undefined at one of several joints.
+    # A force that needs more than its own joint is undefined at one of several joints. A guide, an
+    # input and a servo belong to a joint.
     needs_own_joint_only = effect.needs in ("", "guide", "input", "servo")
     return needs_own_joint_only and issubclass(effect, Force | Friction)
 
@@ -599,10 +611,13 @@ def _acts_at(
         return effect_place.last and is_driven
     if effect.needs == "servo" and not effect_place.servo:
         return False
+    # The drive of such a joint also drives the preceding joint.
     if effect.name == "joint.coupling" and not effect_place.coupled:
         return False
     # Actuators.
     if effect.at == "actuator":
+        # A relative change of a number of the file, such as a gain, needs one that is not zero.
+        # Numbers that are not stated here, such as a force limit, can always be changed.
         if issubclass(effect, ModelValueEffect):
             return effect_place.stated.get(effect.name, 1.0) != 0.0
         # A power effect is undefined for a set point.

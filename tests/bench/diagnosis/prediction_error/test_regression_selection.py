@@ -5,7 +5,10 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from bench.diagnosis.prediction_error.regression_products import ResponseProducts
-from bench.diagnosis.prediction_error.regression_selection import Regression
+from bench.diagnosis.prediction_error.regression_selection import (
+    Regression,
+    score_by_regression,
+)
 from bench.diagnosis.search.score_test import DirectionGroup
 
 RUNS, SAMPLES, COLUMNS = 4, 80, 6
@@ -119,3 +122,18 @@ def test_an_effect_of_the_model_is_put_back(rows):
     direct = regression_of(rows, target, singles()[1:], always=(5,))
     assert rest.solve([])[0] == pytest.approx(direct.solve([])[0], rel=1e-10)
     np.testing.assert_allclose(rest.gains([]), direct.gains([]), atol=1e-7)
+
+
+def test_scores_name_what_acts_and_without_effects_nothing_is_significant(rows):
+    target = rows @ np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0]) + noise()
+    regression = regression_of(rows, target, singles())
+    names = {group.effect for group in regression.groups}
+    scores = score_by_regression(regression, names, np.random.default_rng(2))
+    assert scores.effects[0] == "effect2"
+    assert scores.p_value < 1e-10
+    # The others are noise.
+    others = score_by_regression(regression, names - {"effect2"}, np.random.default_rng(2))
+    assert others.p_value > 1e-4
+    nothing = score_by_regression(regression, {"unknown"}, np.random.default_rng(2))
+    assert nothing.effects == ()
+    assert nothing.p_value == 1.0
