@@ -5,7 +5,6 @@ The page, report.html, has the data, the conclusion and the limitations of the c
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass
@@ -22,7 +21,10 @@ from bench.benchmark.comparison_printed_figures import (
     format_threshold_caption,
     list_figure_names,
 )
-from bench.benchmark.isolation.process_errors import ISOLATION_NOTE, without_isolation
+from bench.benchmark.isolation.process_errors import (
+    ISOLATION_NOTE,
+    format_failure_reason,
+)
 from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
 from bench.benchmark.problem.tuning_problem import numeric_warnings_silenced
 from bench.benchmark.statistics.comparison_statistics import (
@@ -56,7 +58,6 @@ _PAGE_DIGITS = 7
 """Number of significant digits of values on the page that are in no file next to it."""
 _PRINTED_CHECKPOINTS = (3, 10)
 """Numbers of simulations for printed errors along directions, in addition to the budget."""
-_TRACEBACK_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<function>\S+)')
 
 
 @dataclass(frozen=True)
@@ -370,20 +371,3 @@ def format_failures(failed: pd.DataFrame) -> list[str]:
     isolated_tuners = list(dict.fromkeys(failed["tuner"][is_refused].astype(str)))
     note = [f"{', '.join(isolated_tuners)}: {ISOLATION_NOTE}"] if isolated_tuners else []
     return ["", "failures", *laid_out, *note]
-
-
-def format_failure_reason(reason: str) -> str:
-    """Return error and location from a reason, which may be a traceback.
-
-    A traceback becomes one line, ``ValueError: MESSAGE (FILE.py, line 7, in FUNCTION)``; of another
-    reason the last line is returned.
-    """
-    lines = without_isolation(reason.strip()).splitlines() or [""]
-    frames = [i for i, line in enumerate(lines) if _TRACEBACK_FRAME.search(line)]
-    if not frames:
-        return lines[-1].strip()
-    # The error message is the first line without indentation after the last frame; it may be
-    # followed by pages of text.
-    message = next((line for line in lines[frames[-1] + 1 :] if line[:1].strip()), lines[-1])
-    file, number, function = _TRACEBACK_FRAME.findall(lines[frames[-1]])[0]
-    return f"{message} ({Path(file).name}, line {number}, in {function})"

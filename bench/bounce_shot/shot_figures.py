@@ -17,7 +17,7 @@ from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import ExampleShot, execute_example
 from bench.bounce_shot.shot_geometry import ShotGeometry, find_descent_index
 from bench.bounce_shot.shot_sampling import ShotSetup
-from bench.figures.figure_layout import add_trust_note, make_panel_grid
+from bench.figures.figure_layout import add_trust_note, finish_chart, make_panel_grid
 from bench.figures.figure_output import FigureFiles, render_all_formats
 from bench.figures.style import (
     BLACK,
@@ -28,7 +28,7 @@ from bench.figures.style import (
     VERMILION,
     get_mark_style,
 )
-from bench.pages.chart import Axis, Panel, draw_chart, finish_chart, make_method_series
+from bench.pages.chart import Axis, Panel, draw_chart, make_method_series
 from sims.core.simulator import Array
 
 if TYPE_CHECKING:

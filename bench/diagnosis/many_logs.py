@@ -33,11 +33,12 @@ from bench.diagnosis.report.cause_and_value_text import (
     joined,
 )
 from bench.figures import figure_output, style
+from bench.figures.figure_layout import finish_chart
 from bench.figures.figure_settings import is_pdf_wanted
 from bench.figures.label_text import break_name
 from bench.logs.recording_digest import compute_content_digest, compute_recording_digest
 from bench.logs.recording_joining import make_log_names
-from bench.pages.chart import Axis, Panel, ReferenceLine, Series, draw_chart, finish_chart
+from bench.pages.chart import Axis, Panel, ReferenceLine, Series, draw_chart
 from bench.pages.html_page import HtmlPage
 from bench.pages.text_format import format_csv
 from sims.core.files import check_folder_empty, get_first_line, write_atomically

@@ -24,18 +24,10 @@ from bench.diagnosis_benchmark.result_tables import (
     select_single_effects,
 )
 from bench.figures import figure_layout, style
-from bench.figures.figure_layout import add_trust_note
+from bench.figures.figure_layout import add_trust_note, finish_chart
 from bench.figures.figure_output import FigureFiles, render_all_formats
 from bench.figures.style import GREY, MarkStyle, get_mark_style, make_mark_style
-from bench.pages.chart import (
-    Axis,
-    Panel,
-    ReferenceLine,
-    Series,
-    draw_chart,
-    finish_chart,
-    make_method_series,
-)
+from bench.pages.chart import Axis, Panel, ReferenceLine, Series, draw_chart, make_method_series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

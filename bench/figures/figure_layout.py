@@ -88,3 +88,30 @@ def add_trust_note(figure: Figure, trusted: bool) -> Figure:
             figure, f"{TRUSTED_TUNERS_NOTE.capitalize()}. {figure.get_supxlabel()}", letters=17
         )
     return figure
+
+
+def finish_chart(
+    figure: Figure,
+    axis: Axes,
+    title: str = "",
+    caption: str = "",
+    legend: Any = "outside right center",
+) -> Figure:
+    """Add the legend, title and caption to a figure of a chart, and return it.
+
+    Args:
+        figure: Figure of `draw_chart`.
+        axis: Panel whose series are in the legend, if there are several.
+        title: Title; empty for none.
+        caption: Caption; empty for none.
+        legend: Location of the legend.
+    """
+    handles, labels = axis.get_legend_handles_labels()
+    if len(labels) > 1:
+        # Handles of this length show the dashes of a line.
+        figure.legend(handles, labels, loc=legend, fontsize=8, frameon=False, handlelength=3.2)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    if caption:
+        add_caption(figure, caption, letters=16)
+    return figure

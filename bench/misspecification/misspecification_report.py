@@ -22,7 +22,7 @@ from bench.benchmark.storage.result_folder import (
     read_configuration,
 )
 from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
-from bench.figures.figure_layout import add_trust_note
+from bench.figures.figure_layout import add_trust_note, finish_chart
 from bench.figures.figure_output import write_figure
 from bench.figures.style import BLUE, VERMILION, TunerStyles, make_mark_style
 from bench.misspecification import misspecification_statistics
@@ -33,15 +33,7 @@ from bench.misspecification.misspecification_statistics import (
     PREDICTION,
     StudyScores,
 )
-from bench.pages.chart import (
-    Axis,
-    Panel,
-    ReferenceLine,
-    Series,
-    draw_chart,
-    finish_chart,
-    make_method_series,
-)
+from bench.pages.chart import Axis, Panel, ReferenceLine, Series, draw_chart, make_method_series
 from bench.pages.template import render_text
 from sims.core.files import write_atomically
 

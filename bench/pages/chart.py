@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bench.figures.figure_layout import add_caption, make_panel_grid, set_title, style_axis
+from bench.figures.figure_layout import make_panel_grid, set_title, style_axis
 from bench.figures.label_text import break_name
 from bench.figures.style import CAPTION_GREY, NOISE_BAND_GREY, MarkStyle
 from sims.core.simulator import Array
@@ -362,33 +362,6 @@ def draw_chart(
     for axis, panel in zip(axes, panels, strict=False):
         _draw_rules(axis, panel.rules, horizontal)
     return figure, axes[: len(panels)]
-
-
-def finish_chart(
-    figure: Figure,
-    axis: Axes,
-    title: str = "",
-    caption: str = "",
-    legend: Any = "outside right center",
-) -> Figure:
-    """Add the legend, title and caption to a figure of a chart, and return it.
-
-    Args:
-        figure: Figure of `draw_chart`.
-        axis: Panel whose series are in the legend, if there are several.
-        title: Title; empty for none.
-        caption: Caption; empty for none.
-        legend: Location of the legend.
-    """
-    handles, labels = axis.get_legend_handles_labels()
-    if len(labels) > 1:
-        # Handles of this length show the dashes of a line.
-        figure.legend(handles, labels, loc=legend, fontsize=8, frameon=False, handlelength=3.2)
-    if title:
-        figure.suptitle(title, fontsize=11)
-    if caption:
-        add_caption(figure, caption, letters=16)
-    return figure
 
 
 def _draw_panel(axis: Axes, panel: Panel, table: pd.DataFrame | Table, horizontal: bool) -> None:

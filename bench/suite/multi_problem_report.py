@@ -33,10 +33,10 @@ from bench.benchmark.statistics.tuner_ranking import (
     compute_problem_ranks,
 )
 from bench.benchmark.storage.result_folder import read_comparison
-from bench.figures.figure_layout import add_trust_note, make_panel_grid
+from bench.figures.figure_layout import add_trust_note, finish_chart, make_panel_grid
 from bench.figures.figure_output import FigureFiles, render_all_formats, write_figures
 from bench.figures.style import NEUTRAL_MARK, MarkStyle, get_colour, get_mark_style
-from bench.pages.chart import Axis, Panel, draw_chart, finish_chart, make_method_series
+from bench.pages.chart import Axis, Panel, draw_chart, make_method_series
 from bench.pages.html_page import HtmlPage
 from sims.core.files import write_atomically
 from sims.core.simulator import Array, InputError

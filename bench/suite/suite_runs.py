@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from bench.benchmark.problem.experiment_config import Experiment
 from bench.benchmark.statistics.comparison_statistics import (
     REQUIRED_RUN_COLUMNS,
     ComparisonStatistics,
 )
-from bench.benchmark.statistics.error_curves import RunCurves
+from bench.benchmark.statistics.error_curves import replace_unknown_errors
 from bench.benchmark.storage.reference_results import REFERENCE_FOLDERS
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
@@ -192,7 +191,7 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
         }
     )
     has_used_budget = (run_statuses["status"] == "done").to_numpy()
-    errors = _replace_unknown_errors(curves, has_used_budget, experiment.budget)
+    errors = replace_unknown_errors(curves, has_used_budget, experiment.budget)
     properties = {
         "problem": problem,
         "parameters": _count_parameters(experiment),
@@ -216,30 +215,6 @@ def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
     )
     reasons = skipped[SKIPPED_COLUMNS].drop_duplicates("tuner")
     return SuiteRuns(runs, errors, pd.DataFrame(cell_rows, columns=CELL_COLUMNS), training, reasons)
-
-
-def _replace_unknown_errors(
-    curves: RunCurves, has_used_budget: NDArray[np.bool_], budget: int
-) -> Array:
-    """Return the errors of runs, with NaN where they are unknown and infinity where a run failed.
-
-    A run that has used up a smaller budget than the experiment's says nothing about more
-    simulations. A run that stopped by itself keeps its last error.
-
-    Args:
-        curves: errors of R runs after 0 to K simulations.
-        has_used_budget: (R,) True for a run that ended because its budget was used up.
-        budget: number of simulations of the experiment; a tuner may have a smaller one.
-
-    Returns:
-        (R, K + 1) errors.
-    """
-    errors = curves.values.copy()
-    has_smaller_budget = has_used_budget & (curves.used < budget)
-    is_after_end = np.arange(errors.shape[1]) > curves.used[:, None]
-    errors[has_smaller_budget[:, None] & is_after_end] = np.nan
-    errors[curves.failed] = np.inf
-    return errors
 
 
 def name_cell(problem: str, kind: str, condition: str, experiment: Experiment) -> str:

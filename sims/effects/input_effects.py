@@ -382,3 +382,50 @@ def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
     moving_share = np.abs(changes) / np.where(max_changes > 0, max_changes, np.inf)
     mean_values = step_end_values - 0.5 * moving_share * changes
     return np.where(np.isfinite(max_changes), mean_values, signal.values)
+
+
+def average_earlier_signal(signal: Signal, delay: Array) -> Array:
+    """Return means (L, S) over each step of the signal `delay` (L, 1) seconds earlier.
+
+    Before the first step, the signal has its initial value. A mean is the difference of the
+    integral of the signal at both ends of the delayed step, divided by the step. Values remain
+    unchanged where the delay is not above zero, and in steps without length.
+
+    Shapes: L batch elements, S steps.
+
+    Args:
+        signal: signal over the steps.
+        delay: (L, 1) delays in seconds.
+    """
+    step_ends = signal.times
+    step_starts = step_ends - signal.steps
+    cumulative_integral = np.cumsum(signal.values * signal.steps, axis=1)
+    averages = signal.values.copy()
+    for batch_index in np.flatnonzero(delay[:, 0] > 0):
+        # The integral is linear between the ends of steps, and zero where the first step starts. It
+        # begins 1 s before that with minus the initial value, as the signal is constant there;
+        # `_integrate_signal` extends it to earlier times.
+        knots = np.concatenate(
+            [
+                [step_starts[batch_index, 0] - 1.0, step_starts[batch_index, 0]],
+                step_ends[batch_index],
+            ]
+        )
+        integral = np.concatenate(
+            [[-signal.start[batch_index, 0], 0.0], cumulative_integral[batch_index]]
+        )
+        first, last = (
+            _integrate_signal(knots, integral, t[batch_index] - delay[batch_index])
+            for t in (step_starts, step_ends)
+        )
+        steps = signal.steps[batch_index]
+        has_length = steps > 0
+        averages[batch_index, has_length] = (last - first)[has_length] / steps[has_length]
+    return averages
+
+
+def _integrate_signal(knots: Array, integral: Array, t: Array) -> Array:
+    """Return the integral at times t, extrapolated linearly before the first knot."""
+    interpolated: Array = np.interp(t, knots, integral)
+    slope = (integral[1] - integral[0]) / (knots[1] - knots[0])
+    return interpolated + slope * np.minimum(t - knots[0], 0.0)

@@ -44,6 +44,7 @@ from sims.core.effect import Coefficient, Force, Input, Signal
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
 from sims.effects.compiled_recursions import ACCELERATION_LIMIT, run_recursion
+from sims.effects.input_effects import average_earlier_signal
 
 _SET_POINT_UNITS = ("m/s^2", "m", "rad")
 """Units of a set point; point systems have no servo."""
@@ -111,7 +112,7 @@ class ServoDerivativeAction(Input):
             signal: signal (L, S) over the steps.
         """
         lead = np.maximum(c[0], 0.0)
-        earlier = _average_earlier_signal(signal, np.where(lead > 0, _CONTROL_PERIOD, 0.0))
+        earlier = average_earlier_signal(signal, np.where(lead > 0, _CONTROL_PERIOD, 0.0))
         return signal.values + lead / _CONTROL_PERIOD * (signal.values - earlier)  # (2)
 
 
@@ -144,53 +145,6 @@ class ServoMotionProfile(Input):
         start = np.column_stack([signal.start[:, 0], limit[:, 0]])
         means = run_recursion(ACCELERATION_LIMIT, signal.values, signal.steps, start)  # (3)
         return np.where(limit > 0, means, signal.values)
-
-
-def _average_earlier_signal(signal: Signal, delay: Array) -> Array:
-    """Return means (L, S) over each step of the signal `delay` (L, 1) seconds earlier.
-
-    Before the first step, the signal has its initial value. A mean is the difference of the
-    integral of the signal at both ends of the delayed step, divided by the step. Values remain
-    unchanged where the delay is not above zero, and in steps without length.
-
-    Shapes: L batch elements, S steps.
-
-    Args:
-        signal: signal over the steps.
-        delay: (L, 1) delays in seconds.
-    """
-    step_ends = signal.times
-    step_starts = step_ends - signal.steps
-    cumulative_integral = np.cumsum(signal.values * signal.steps, axis=1)
-    averages = signal.values.copy()
-    for batch_index in np.flatnonzero(delay[:, 0] > 0):
-        # The integral is linear between the ends of steps, and zero where the first step starts. It
-        # begins 1 s before that with minus the initial value, as the signal is constant there;
-        # `_integrate_signal` extends it to earlier times.
-        knots = np.concatenate(
-            [
-                [step_starts[batch_index, 0] - 1.0, step_starts[batch_index, 0]],
-                step_ends[batch_index],
-            ]
-        )
-        integral = np.concatenate(
-            [[-signal.start[batch_index, 0], 0.0], cumulative_integral[batch_index]]
-        )
-        first, last = (
-            _integrate_signal(knots, integral, t[batch_index] - delay[batch_index])
-            for t in (step_starts, step_ends)
-        )
-        steps = signal.steps[batch_index]
-        has_length = steps > 0
-        averages[batch_index, has_length] = (last - first)[has_length] / steps[has_length]
-    return averages
-
-
-def _integrate_signal(knots: Array, integral: Array, t: Array) -> Array:
-    """Return the integral at times t, extrapolated linearly before the first knot."""
-    interpolated: Array = np.interp(t, knots, integral)
-    slope = (integral[1] - integral[0]) / (knots[1] - knots[0])
-    return interpolated + slope * np.minimum(t - knots[0], 0.0)
 
 
 _VOLTAGE_LOSS_RANGES = ((0, 0), (0, 0.2), (0, 2))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+from pathlib import Path
 
 ISOLATION_NOTE = (
     "tuners run isolated: no files, no processes, no network; use --trust while developing"
@@ -17,6 +18,8 @@ _REFUSED_ACCESS_PATTERN = re.compile(
     r"|File too large|Too many open files|can't start new thread|Network is unreachable"
 )
 """Pattern of exception lines after the kernel refused a file, a process or a socket."""
+
+_TRACEBACK_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<function>\S+)')
 
 
 class RunEndedError(Exception):
@@ -79,3 +82,20 @@ def describe_exit(process: str, code: int | None) -> str:
     except ValueError:
         name = f"signal {-code}"
     return f"{process} was killed by {name}"
+
+
+def format_failure_reason(reason: str) -> str:
+    """Return error and location from a reason, which may be a traceback.
+
+    A traceback becomes one line, ``ValueError: MESSAGE (FILE.py, line 7, in FUNCTION)``; of another
+    reason the last line is returned.
+    """
+    lines = without_isolation(reason.strip()).splitlines() or [""]
+    frames = [i for i, line in enumerate(lines) if _TRACEBACK_FRAME.search(line)]
+    if not frames:
+        return lines[-1].strip()
+    # The error message is the first line without indentation after the last frame; it may be
+    # followed by pages of text.
+    message = next((line for line in lines[frames[-1] + 1 :] if line[:1].strip()), lines[-1])
+    file, number, function = _TRACEBACK_FRAME.findall(lines[frames[-1]])[0]
+    return f"{message} ({Path(file).name}, line {number}, in {function})"

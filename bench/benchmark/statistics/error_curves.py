@@ -579,3 +579,27 @@ def _compute_median_with_interval(
         values[:, None], compute_resampled_medians, *names, resamples=_BOOTSTRAP_RESAMPLES
     )
     return float(np.median(values)), float(low[0]), float(high[0])
+
+
+def replace_unknown_errors(
+    curves: RunCurves, has_used_budget: NDArray[np.bool_], budget: int
+) -> Array:
+    """Return the errors of runs, with NaN where they are unknown and infinity where a run failed.
+
+    A run that has used up a smaller budget than the experiment's says nothing about more
+    simulations. A run that stopped by itself keeps its last error.
+
+    Args:
+        curves: errors of R runs after 0 to K simulations.
+        has_used_budget: (R,) True for a run that ended because its budget was used up.
+        budget: number of simulations of the experiment; a tuner may have a smaller one.
+
+    Returns:
+        (R, K + 1) errors.
+    """
+    errors = curves.values.copy()
+    has_smaller_budget = has_used_budget & (curves.used < budget)
+    is_after_end = np.arange(errors.shape[1]) > curves.used[:, None]
+    errors[has_smaller_budget[:, None] & is_after_end] = np.nan
+    errors[curves.failed] = np.inf
+    return errors

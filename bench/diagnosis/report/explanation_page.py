@@ -31,6 +31,7 @@ from bench.diagnosis.report.motion_chart import (
     make_motion_chart,
 )
 from bench.diagnosis.report.report_data import DiagnosisReportData, ResidualProfile
+from bench.diagnosis.report.residual_analysis import build_gap_location_table
 from bench.diagnosis.report.residual_figure import MAX_LABEL_LENGTH, select_informative_profiles
 from bench.diagnosis.validation.confidence_intervals import Z95
 from bench.figures.figure_output import FigureFiles
@@ -112,29 +113,6 @@ def render_report(
         residuals=residual_analysis,
         wording=cause_and_value_text,
     )
-
-
-def build_gap_location_table(report: DiagnosisReportData) -> Table:
-    """Build a table with one row per part of the data: its RMS residual in units of the noise.
-
-    Args:
-        report: Data of the report, whose gap locations are runs, channels and phases of the motion.
-    """
-    rows = []
-    for location in report.gap_locations:
-        row = {
-            "kind": location.kind,
-            "part": sanitise(location.label, 80),
-            "samples": location.samples,
-            "before": location.before,
-        }
-        if report.has_extended_model:
-            row["after"] = location.after
-        if is_robot(report):
-            name = location.label if location.kind == "channel" else ""
-            row["joint"] = find_joint(report, "channel", name)
-        rows.append(row)
-    return Table.from_rows(rows)
 
 
 def build_residual_profile_table(report: DiagnosisReportData) -> Table:

@@ -13,6 +13,9 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import Mask
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.report.cause_and_value_text import sanitise
+from bench.diagnosis.report.diagnosed_places import find_joint
+from bench.diagnosis.report.joint_figure import is_robot
 from bench.diagnosis.report.motion_phases import compute_slopes, compute_speeds, detect_phases
 from bench.diagnosis.report.report_data import (
     DataSplit,
@@ -20,6 +23,7 @@ from bench.diagnosis.report.report_data import (
     GapLocation,
     ResidualProfile,
 )
+from bench.pages.page_table import Table
 from sims.core.simulator import Array
 
 if TYPE_CHECKING:
@@ -328,3 +332,26 @@ def _iterate_joint_variables(
         f"u.{actuator.name}" for actuator in robot.actuators if actuator.joint == joint.name
     ]
     yield from _iterate_inputs(evaluator, [*commands, f"force.{joint.name}"])
+
+
+def build_gap_location_table(report: DiagnosisReportData) -> Table:
+    """Build a table with one row per part of the data: its RMS residual in units of the noise.
+
+    Args:
+        report: Data of the report, whose gap locations are runs, channels and phases of the motion.
+    """
+    rows = []
+    for location in report.gap_locations:
+        row = {
+            "kind": location.kind,
+            "part": sanitise(location.label, 80),
+            "samples": location.samples,
+            "before": location.before,
+        }
+        if report.has_extended_model:
+            row["after"] = location.after
+        if is_robot(report):
+            name = location.label if location.kind == "channel" else ""
+            row["joint"] = find_joint(report, "channel", name)
+        rows.append(row)
+    return Table.from_rows(rows)

@@ -240,7 +240,7 @@ def test_failed_runs_make_the_exit_code_1_unless_allowed(tmp_path):
 
 
 def test_first_line_says_what_and_where():
-    from bench.benchmark.comparison_report import format_failure_reason
+    from bench.benchmark.isolation.process_errors import format_failure_reason
 
     chained = (
         "Traceback (most recent call last):\n"
