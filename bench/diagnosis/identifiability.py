@@ -278,7 +278,7 @@ class _IdentifiabilityAssessment:
         runs, samples, count = projected.shape
         return projected.reshape(runs * samples, count)
 
-    def _project_out_parameters(self, candidates: Sequence[int], basis: Array) -> Array:
+    def _project_out_states_and_parameters(self, candidates: Sequence[int], basis: Array) -> Array:
         """Return the part of k responses, in units of the noise, that nothing else can reproduce.
 
         The parts that a change of the initial states or of the q free parameters can reproduce are
@@ -286,7 +286,8 @@ class _IdentifiabilityAssessment:
 
         Args:
             candidates: indices of k candidates.
-            basis: (N, q) orthonormal basis of the derivatives by the free parameters.
+            basis: (N, q) orthonormal basis of the derivatives by the free parameters, from which
+                the changes by initial states are already projected out.
         """
         responses = np.where(
             self.observed_mask[..., None], self.direction_set.responses[..., candidates], 0.0
@@ -398,7 +399,7 @@ class _IdentifiabilityAssessment:
         for begin in range(0, len(indices), CANDIDATES_PER_BLOCK):
             block = indices[begin : begin + CANDIDATES_PER_BLOCK]
             # 1. Information on each direction.
-            columns = self._project_out_parameters(block, basis)
+            columns = self._project_out_states_and_parameters(block, basis)
             norms = np.sqrt(np.einsum("nk,nk->k", columns, columns))
             # 2. The most sensitive direction.
             for column, norm, k in zip(columns.T, norms.tolist(), block, strict=True):

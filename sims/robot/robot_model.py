@@ -230,11 +230,11 @@ class RobotModel:
 
     @cached_property
     def base_orientations(self) -> Mapping[str, tuple[float, ...]]:
-        """Orientation (w, x, y, z) in the file of each body with a recorded pose, by its joint.
+        """Orientation (w, x, y, z) that the model file gives each body with a recorded pose.
 
-        The joint is the floating one of the file, which slides and hinges of the body replace.
+        The keys are the names of the free or ball joints of the file. In the compiled model, slides
+        and hinges named JOINT.ANGLE replace them, so that a body is found by its first hinge.
         """
-        # Any of the new joints leads to the body; a ball joint is replaced by hinges only.
         hinges = {base: self.joint(f"{base}.{ANGLES[0]}").id for base in self.recorded_bases}
         return {
             base: tuple(self.compiled.body(int(self.compiled.jnt_bodyid[hinge])).quat.tolist())

@@ -226,12 +226,14 @@ class VideoFile:
         # FFmpeg errors without a Python class, such as an unexpected end of the file.
         except (ValueError, av.FFmpegError):
             raise InputError(f"{self.path}: {_describe_unreadable_file(self.path)}") from None
-        if not file.streams.video:
-            if not len(file.streams):
-                raise InputError(f"{self.path}: {_describe_unreadable_file(self.path)}")
-            file.close()
-            raise InputError(f"{self.path}: expected a video, found a file without a video stream")
-        return file
+        if file.streams.video:
+            return file
+        # FFmpeg takes some files for a container without any stream: they are no video at all.
+        has_streams = len(file.streams) > 0
+        file.close()
+        if not has_streams:
+            raise InputError(f"{self.path}: {_describe_unreadable_file(self.path)}")
+        raise InputError(f"{self.path}: expected a video, found a file without a video stream")
 
     def _decode_frames(self, file: Any) -> Iterator[tuple[float, RgbImage | None]]:
         """Iterate over time in seconds and picture of each frame.

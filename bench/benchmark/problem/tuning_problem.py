@@ -124,8 +124,8 @@ class TuningProblem:
     ) -> Simulator:
         """Build a simulator; a setting that it does not accept becomes an error of the experiment.
 
-        It is called for the tuned simulator, and for the one that makes the targets if this is
-        another.
+        It is called for the tuned simulator, and for the one that makes the targets if that is a
+        different one.
 
         Args:
             kind: class of the simulator.
@@ -136,7 +136,7 @@ class TuningProblem:
         try:
             return kind(constants=experiment.fixed, observe=observe, **settings)
         except TypeError as error:  # a setting that its constructor does not accept
-            subject = f"experiment {experiment.name}: simulator {experiment.simulator}"
+            subject = f"experiment {experiment.name}: simulator {kind.name}"
             raise InputError(f"{subject}: {error}") from None
 
     def _check_world(self) -> None:

@@ -67,12 +67,12 @@ class Plugin:
 
     Attributes:
         path: path of the file; empty for an installed plugin.
-        is_loaded: whether its code runs in the harness's processes.
+        runs_in_process: whether its code runs in the harness's processes.
         parts: descriptions of its tuners and diagnosers if it is not loaded.
     """
 
     path: str
-    is_loaded: bool = True
+    runs_in_process: bool = True
     parts: tuple[dict[str, Any], ...] = ()
 
 
@@ -117,13 +117,14 @@ def _make_stub(description: dict[str, Any]) -> Any:
 def register_plugins(plugins: Iterable[Plugin]) -> None:
     """Register plugins in this process: load their code, or make stubs of their descriptions.
 
-    A stub is a class with the properties of a tuner or diagnoser, but without its code.
+    A stub is a class with the properties of a tuner or diagnoser, but without its code. Plugins
+    whose code runs in this process have no descriptions (`parts`), so that no stub is made of them.
 
     Raises:
         InputError: a plugin has an error.
     """
     plugins = list(plugins)
-    load_plugins(plugin.path for plugin in plugins if plugin.is_loaded)
+    load_plugins(plugin.path for plugin in plugins if plugin.runs_in_process)
     for plugin in plugins:
         path = Path(plugin.path) if plugin.path else None
         for description in plugin.parts:
@@ -246,7 +247,8 @@ def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> 
     them.
 
     Args:
-        plugins: inspected plugin files; `is_loaded` is True if the simulator or effect is needed.
+        plugins: inspected plugin files; `runs_in_process` is True if the simulator or effect is
+            needed.
         experiment: configuration with the tuners.
 
     Raises:
@@ -255,7 +257,7 @@ def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> 
     labels = {entry.tuner: entry.label for entry in experiment.tuners}
     for plugin in plugins:
         for part in plugin.parts:
-            if plugin.is_loaded and part["kind"] == "tuner" and part["name"] in labels:
+            if plugin.runs_in_process and part["kind"] == "tuner" and part["name"] in labels:
                 raise _make_untrusted_code_error(labels[part["name"]], plugin.path)
 
 

@@ -120,20 +120,19 @@ def refuse_broken_conventions(runs: SimulatedRuns) -> None:
 def _is_checked_late(runs: SimulatedRuns) -> bool:
     """Return whether units are checked only after no effect has explained the gap.
 
-    This is the order for robots. If the runs of a robot could be filtered, but its free numbers
-    could not be identified from the prediction errors, units are checked before the search, as for
+    This is the order for robots, except for a robot with free base parameters that a filter could
+    not identify: a wrong unit may be the reason, so units are checked before the search, as for
     other systems.
 
     Args:
         runs: the runs, before or after the search.
     """
-    # The robot has free numbers, and a filter, but no numbers that were identified.
-    has_unidentified_base = (
-        bool(runs.fitting.base_indices.size)
-        and runs.context.identified is None
-        and runs.fitting.filtered_runs is not None
-    )
-    return runs.kind.has_model and not has_unidentified_base
+    if not runs.kind.has_model:
+        return False
+    has_base_parameters = bool(runs.fitting.base_indices.size)
+    could_filter = runs.fitting.filtered_runs is not None
+    failed_to_identify = could_filter and runs.context.identified is None
+    return not (has_base_parameters and failed_to_identify)
 
 
 def _make_subject(runs: SimulatedRuns) -> Subject:

@@ -643,7 +643,8 @@ class _ServoFitter:
     ) -> tuple[Array, list[tuple[str, ...]]]:
         """Return parameters (P,) and laws of a model with the laws of one joint at all joints.
 
-        A law that a joint has keeps its coefficients; one that it cannot have is left out.
+        A law that a joint has keeps its coefficients; one that it cannot have is left out. Laws are
+        names with a place, such as ``drag.linear@elbow``; the part before the @ is compared.
 
         Args:
             source: the model from which the laws and their coefficients are taken.
@@ -653,11 +654,11 @@ class _ServoFitter:
         slices = self._evaluator.coefficient_slices
         theta, laws = target.theta.copy(), list(target.laws)
         for joint, available in enumerate(self._laws_at_joint):
-            for name in source.laws[source_joint]:
-                effect = available.get(name.partition("@")[0])
-                if effect is not None and effect not in laws[joint]:
-                    laws[joint] = (*laws[joint], effect)
-                    theta[slices[effect]] = source.theta[slices[name]]
+            for source_law in source.laws[source_joint]:
+                law = available.get(source_law.partition("@")[0])
+                if law is not None and law not in laws[joint]:
+                    laws[joint] = (*laws[joint], law)
+                    theta[slices[law]] = source.theta[slices[source_law]]
         return theta, laws
 
     def _is_better(self, model: ServoModel, other: ServoModel, joint: int) -> bool:

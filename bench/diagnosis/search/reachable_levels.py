@@ -20,30 +20,32 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
     A limit above such a value changes nothing, so the search tries fractions of it. The quantity
     follows from the kind of the first coefficient (`Coefficient.of`):
 
-    * an input, its rate or acceleration, the error of a servo, or a level: the largest one in the
-      recorded runs;
-    * the travel of a joint, for backlash: its largest recorded range;
-    * a compliance ("give"), the force of a drive, or a level that is not recorded: the largest
-      plausible coefficient, because the range of the quantity is not recorded.
+    1. a compliance ("give"), the force of a drive, or a level that is not recorded: the largest
+       plausible coefficient, because the range of the quantity is not recorded;
+    2. the travel of a joint, for backlash: its largest recorded range;
+    3. an input, its rate or acceleration, the error of a servo, or a level: the largest one in the
+       recorded runs.
 
     Args:
         evaluator: evaluator with the recorded runs.
         name: name of the effect, with its place on a robot: ``drag.linear@elbow``.
 
     Returns:
-        One value for each member of the effect (a family has several).
+        One value for each member of the effect (a family has several). Compliances and backlash are
+        no families, and a limit of a drive has one coefficient, so these have one value each.
     """
     effect = evaluator.available_effects[name]
     # An effect that is no family is its own only member.
     members = members_of(effect)
     kind = effect.coefficients[0].of
-    # A compliance.
+    # 1. A compliance.
     if kind == "give":
         # The coefficients after the first one are shape parameters.
         return np.array([list_coefficients(evaluator, name)[0].bounds[1]])
     # A force, or a level that is not recorded.
     if kind == "drive" or (kind == "level" and not _get_limited_channel(evaluator, effect)):
         return np.array([p.bounds[1] for p in list_coefficients(evaluator, name)])
+    # 2. Backlash.
     if kind == "travel":
         return np.array([evaluator.get_effect_travel(name)])
     level_functions = {
@@ -52,7 +54,7 @@ def compute_reachable_levels(evaluator: RunEvaluator, name: str) -> Array:
         "error": _compute_max_servo_error,
         "level": _compute_max_level,
     }
-    # All other kinds are limits of the input itself.
+    # 3. All kinds that are not listed are limits of the input itself.
     level_function = level_functions.get(kind, _get_largest_input)
     return np.array(
         [
