@@ -137,8 +137,8 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
 def _list_warnings(recording: Recording, kind: type[Simulator]) -> list[str]:
     """List what looks wrong in a recording.
 
-    These are omissions of its logs, time stamps, missing initial poses, and signals that are
-    missing or beyond limits.
+    These are omissions of its logs, time stamps, missing initial poses, servos that are unstable at
+    the time step, and signals that are missing or beyond limits.
 
     Args:
         recording: recorded runs, with their channels, inputs and constants.
@@ -147,11 +147,13 @@ def _list_warnings(recording: Recording, kind: type[Simulator]) -> list[str]:
     from bench.logs.quality.clock_checks import find_anomalies
     from bench.logs.quality.log_quality import find_log_anomalies, format_log_warnings
     from bench.logs.quality.pose_checks import find_missing_base_poses
+    from bench.logs.quality.servo_checks import check_servo_stability
 
     oddities = [
         *find_log_anomalies(recording),
         *find_anomalies(recording, kind),
         *find_missing_base_poses(recording, kind),
+        *check_servo_stability(recording, kind),
     ]
     return [
         *(oddity.text for oddity in oddities),

@@ -547,13 +547,17 @@ def _compute_residual_shares(evaluator: RunEvaluator, residual: Array, noise: No
     for channel_index, sigma in enumerate(noise.sigma.tolist()):
         is_recorded = np.isfinite(evaluator.observed[..., channel_index])
         values = evaluator.observed[..., channel_index][is_recorded]
+        # A channel may be recorded in held-out runs only.
         deviation = float(np.std(values)) if values.size else 0.0
+        if not deviation > MIN_MOTION_SIGMAS * sigma:
+            residual_ratios.append(0.0)
+            continue
         # A failed simulation counts as an infinite residual.
         channel_residual = np.nan_to_num(residual[..., channel_index][is_recorded], nan=np.inf)
         mean_square = float(np.mean(channel_residual**2))
         # RMS residual beyond the noise.
         excess = max(mean_square - sigma**2, 0.0) ** 0.5
-        residual_ratios.append(excess / deviation if deviation > MIN_MOTION_SIGMAS * sigma else 0.0)
+        residual_ratios.append(excess / deviation)
     return np.array(residual_ratios)
 
 

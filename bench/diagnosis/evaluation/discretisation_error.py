@@ -306,8 +306,9 @@ def correct_discretisation(
     # Motions with the usual step, half of it and a quarter of it.
     motions = [evaluator.simulator.simulate_batch(thetas, scenarios, initial_states)]
     for kind in (half_step_kind, half_step_kind.with_half_step()):
-        finer = kind(evaluator.recording.constants, evaluator.channels, effects=effects)
-        motions.append(finer.simulate_batch(thetas, scenarios, initial_states))
+        constants = evaluator.recording.constants
+        with closing(kind(constants, evaluator.channels, effects=effects)) as finer:
+            motions.append(finer.simulate_batch(thetas, scenarios, initial_states))
     usual_step, half_step, quarter_step = motions
     # Cost in units of a run with the usual step: 1, 2 with half of the step, and 4 with a quarter.
     evaluator.simulation_count += 7 * run_count

@@ -70,6 +70,7 @@ def check_recording_plausible(
         *find_log_anomalies(recording),
         *range_checks.check_joint_ranges(recording, kind),
         *servo_checks.check_servos(recording, kind),
+        *servo_checks.check_servo_stability(recording, kind),
         *clock_checks.find_anomalies(recording, kind),
         *pose_checks.find_missing_base_poses(recording, kind),
         *(

@@ -1,4 +1,4 @@
-"""Check whether joints follow the commands of their servos, and whether the commands are recorded.
+"""Check the servos of a robot: commands, units, and stability at the step of the simulation.
 
 The joint of a servo approximately follows its command: over the samples of all runs, with the
 command u and the position q about their means,
@@ -22,6 +22,7 @@ import numpy as np
 
 from bench.logs.quality.quality_finding import Anomaly
 from sims.core.simulator import Array, InputError, Simulator
+from sims.core.user_messages import join_first_names
 from sims.recording.column_mapping import list_mapped_files
 from sims.recording.log_formats.log_columns import LogFile
 from sims.recording.log_formats.log_files import read_log
@@ -103,6 +104,45 @@ def check_servos(recording: Recording, kind: type[Simulator]) -> Iterator[Anomal
         elif correlation < -MIN_FOLLOWING_CORRELATION and slope < MAX_REVERSED_SLOPE:
             yield Anomaly(f"column {position}: moves against {command}; is a sign wrong?", False)
     yield from _check_exchanged(servo_signals, regressions)
+
+
+def check_servo_stability(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
+    """Find servos whose gains are too large for the time step of their simulation.
+
+    Such a servo oscillates from step to step up to its force limit, so that no simulation agrees
+    with a recording. The poses of the first run are tested, since the inertia depends on them.
+
+    Args:
+        recording: recording to check.
+        kind: simulator class of its system; only robots have servos.
+    """
+    if not kind.has_model:
+        return
+    # These imports are needed for robots only.
+    from sims.robot.contact_pairs import iterate_poses
+    from sims.robot.servo_stability import UnstableServo, list_unstable_servos
+
+    robot: Any = kind
+    settings = robot.numerics
+    worst_by_name: dict[str, UnstableServo] = {}
+    for data in iterate_poses(kind, recording.runs[0].channels):
+        for servo in list_unstable_servos(robot.robot, settings, data):
+            worst = worst_by_name.get(servo.name)
+            if worst is None or servo.growth > worst.growth:
+                worst_by_name[servo.name] = servo
+    if not worst_by_name:
+        return
+    stable_steps = [servo.stable_step for servo in worst_by_name.values() if servo.stable_step]
+    remedy = "simulate with the integrator implicitfast"
+    if len(stable_steps) == len(worst_by_name):
+        remedy += f" or with a time step of {1e3 * min(stable_steps):.3g} ms"
+    servos = "servo" if len(worst_by_name) == 1 else "servos"
+    yield Anomaly(
+        f"{servos} {join_first_names(sorted(worst_by_name))}: gains too large for "
+        f"{settings.integrator} steps of {1e3 * settings.timestep:.3g} ms: the simulation "
+        f"oscillates from step to step, up to the force limit; {remedy}",
+        False,
+    )
 
 
 def _check_exchanged(
