@@ -42,7 +42,9 @@ def test_a_link_without_inertia_does_not_make_the_stamps_milliseconds(tmp_path):
     light = ARM.replace(
         'mass="0.8" diaginertia="0.01 0.01 0.001"', 'mass="1e-7" diaginertia="1e-9 1e-9 1e-9"'
     )
-    assert check_recording_plausible(*load_recording(table_of(tmp_path, model=light))) == []
+    # Its servo is unstable at the step of the model file, which is no fault of the stamps.
+    (warning,) = check_recording_plausible(*load_recording(table_of(tmp_path, model=light)))
+    assert warning.startswith("servo m_elbow: gains too large for Euler steps of 4 ms")
 
 
 ERROR_MESSAGES = {
