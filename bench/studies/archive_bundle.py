@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 from bench import __version__
 from bench.benchmark.storage.provenance import (
     compute_sha256,
-    format_repeated_explain_command,
     read_environment,
+    read_explain_command,
 )
 from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_configuration
 from bench.benchmark.storage.run_journal import SEGMENTS_FOLDER
@@ -113,7 +113,7 @@ def write_bundle(
         command = _format_compare_command(folder, name)
     else:
         files |= _list_recording_files(recordings)
-        command = format_repeated_explain_command(folder)
+        command = read_explain_command(folder)
     metadata = {
         "format": _FORMAT_VERSION,
         "kind": kind,

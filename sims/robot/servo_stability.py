@@ -23,6 +23,7 @@ m = 1 / (r M^-1 r^T). Servos are considered one by one.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +32,8 @@ from sims.core.simulator import Array
 from sims.robot.integrator_settings import IntegratorSettings
 from sims.robot.robot_model import RobotModel
 
+EXPLICIT_INTEGRATORS = ("Euler", "RK4")
+"""Integrators that take the force of a servo from the begin of a step."""
 MIN_GROWTH = 1.01
 """Minimum growth of an error in one step at which a servo counts as unstable."""
 MAX_HALVINGS = 12
@@ -42,9 +45,9 @@ class UnstableServo(NamedTuple):
 
     Attributes:
         name: name of the actuator.
-        growth: factor by which an error grows in a step.
-        stable_step: largest stable step in seconds of those that are the present one divided by a
-            power of two; None if none is stable.
+        growth: factor by which an error grows in a step, in the worst pose.
+        stable_step: largest stable step in seconds in this pose, of those that are the present one
+            divided by a power of two; None if none is stable.
     """
 
     name: str
@@ -85,9 +88,9 @@ class ServoMotion(NamedTuple):
 
 
 def list_unstable_servos(
-    robot: RobotModel, settings: IntegratorSettings, data: Any
+    robot: RobotModel, settings: IntegratorSettings, poses: Iterable[Any]
 ) -> list[UnstableServo]:
-    """List the servos that are unstable in a pose at the time step of a simulation.
+    """List the servos that are unstable at the time step of a simulation in any of some poses.
 
     Servos are actuators whose force is an affine function of their length and velocity. Those with
     an activation (a filter before the force) are left out.
@@ -95,25 +98,35 @@ def list_unstable_servos(
     Args:
         robot: model of the robot.
         settings: time step and integrator of the simulation.
-        data: state (mujoco.MjData) of the compiled model in the pose, after mj_forward.
+        poses: states (mujoco.MjData) of the compiled model, each after mj_forward; they are not
+            evaluated for an implicit integrator.
+
+    Returns:
+        The servos in alphabetical order.
     """
     step, integrator = settings.timestep, settings.integrator
-    if integrator not in ("Euler", "RK4"):
+    if integrator not in EXPLICIT_INTEGRATORS:
         return []
-    unstable_servos = []
-    for name, motion in _list_servo_motions(robot.compiled, data):
-        growth = motion.compute_growth(step, integrator)
-        if growth < MIN_GROWTH:
-            continue
-        smaller_steps = (step / 2**k for k in range(1, MAX_HALVINGS + 1))
-        stable_steps = (
-            smaller_step
-            for smaller_step in smaller_steps
-            if motion.compute_growth(smaller_step, integrator) < MIN_GROWTH
-        )
-        stable_step = next(stable_steps, None)
-        unstable_servos.append(UnstableServo(name, growth, stable_step))
-    return unstable_servos
+    # Largest growth of each servo, and its motion in that pose.
+    worst: dict[str, tuple[float, ServoMotion]] = {}
+    for data in poses:
+        for name, motion in _list_servo_motions(robot.compiled, data):
+            growth = motion.compute_growth(step, integrator)
+            if growth >= MIN_GROWTH and (name not in worst or growth > worst[name][0]):
+                worst[name] = growth, motion
+    return [
+        UnstableServo(name, growth, _find_stable_step(motion, step, integrator))
+        for name, (growth, motion) in sorted(worst.items())
+    ]
+
+
+def _find_stable_step(motion: ServoMotion, step: float, integrator: str) -> float | None:
+    """Return the largest stable step, in seconds, among those of `UnstableServo.stable_step`."""
+    for halvings in range(1, MAX_HALVINGS + 1):
+        smaller_step = step * 0.5**halvings
+        if motion.compute_growth(smaller_step, integrator) < MIN_GROWTH:
+            return smaller_step
+    return None
 
 
 def _list_servo_motions(model: Any, data: Any) -> list[tuple[str, ServoMotion]]:
@@ -130,22 +143,21 @@ def _list_servo_motions(model: Any, data: Any) -> list[tuple[str, ServoMotion]]:
     )
     if not is_servo.any():
         return []
-    inertia: Array = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, inertia)
-    inverse = np.linalg.inv(inertia)
     moments: Array = np.zeros((model.nu, model.nv))
     mujoco.mju_sparse2dense(
         moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
     )
+    accelerations: Array = np.zeros_like(moments)
+    mujoco.mj_solveM(model, data, accelerations, moments)  # M^-1 r^T, by row
+    # Inverse inertia at each actuator; zero if it moves nothing.
+    mobilities = np.einsum("ij,ij->i", moments, accelerations)
     motions = []
     for i in np.flatnonzero(is_servo).tolist():
-        moment = moments[i]
-        # Inverse of the inertia; zero for an actuator that moves nothing.
-        mobility = float(moment @ inverse @ moment)
+        mobility = float(mobilities[i])
         position_gain, velocity_gain = (-model.actuator_biasprm[i, 1:3]).tolist()
         if mobility > 0.0 and (position_gain > 0.0 or velocity_gain > 0.0):
             # Damping of the joints as seen at the actuator, whose length changes by r q.
-            squared_moments = np.square(moment)
+            squared_moments = np.square(moments[i])
             damping = float(squared_moments @ model.dof_damping) / float(squared_moments.sum()) ** 2
             motions.append(
                 (

@@ -25,6 +25,7 @@ from bench.benchmark.statistics.expected_running_time import (
 from bench.benchmark.statistics.paired_tests import compare_all_pairs
 from bench.benchmark.statistics.training_amortisation import (
     TuningCost,
+    TuningCosts,
     build_break_even_tables,
     build_fastest_tuner_table,
     compute_tuning_costs,
@@ -264,7 +265,7 @@ class ComparisonStatistics:
         return build_ert_table(self.curves, self.levels, self._budget)
 
     @cached_property
-    def tuning_costs(self) -> dict[float, dict[str, dict[str, TuningCost]]]:
+    def tuning_costs(self) -> TuningCosts:
         """Cost of every tuner by threshold (the first `PRICED_LEVEL_COUNT`), by range, by tuner."""
         return {
             level: self._compute_tuning_costs(level) for level in self.levels[:PRICED_LEVEL_COUNT]

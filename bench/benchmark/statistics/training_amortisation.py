@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -86,6 +87,10 @@ class TuningCost:
         training_seconds = self.fit_simulations * cost + learning_seconds
         result: Array = tuning_seconds + training_seconds / targets
         return result
+
+
+TuningCosts: TypeAlias = Mapping[float, Mapping[str, Mapping[str, TuningCost]]]
+"""Costs by error threshold, by range of targets, and by tuner."""
 
 
 def compute_tuning_costs(
@@ -231,16 +236,14 @@ def build_break_even_table(
     return pd.DataFrame(lines, columns=BREAK_EVEN_COLUMNS)
 
 
-def build_break_even_tables(
-    experiment: str, tuning_costs: Mapping[float, Mapping[str, Mapping[str, TuningCost]]]
-) -> pd.DataFrame:
+def build_break_even_tables(experiment: str, tuning_costs: TuningCosts) -> pd.DataFrame:
     """Build the table of break-even targets for all thresholds and ranges.
 
     It says from how many targets on the training of a learned tuner costs less than a search.
 
     Args:
         experiment: name of the experiment.
-        tuning_costs: cost of every tuner by error threshold, by range, by tuner.
+        tuning_costs: cost of every tuner.
 
     Returns:
         Table with the columns `BREAK_EVEN_COLUMNS`.
@@ -299,9 +302,7 @@ def find_cheapest_tuners(
     ]
 
 
-def build_fastest_tuner_table(
-    experiment: str, tuning_costs: Mapping[float, Mapping[str, Mapping[str, TuningCost]]]
-) -> pd.DataFrame:
+def build_fastest_tuner_table(experiment: str, tuning_costs: TuningCosts) -> pd.DataFrame:
     """Build the table of the fastest tuner by duration of one simulation, per threshold and range.
 
     A training is shared by `TARGETS_PER_TRAINING` targets. Each row has the bounds of the duration
@@ -309,7 +310,7 @@ def build_fastest_tuner_table(
 
     Args:
         experiment: name of the experiment.
-        tuning_costs: cost of every tuner by error threshold, by range, by tuner.
+        tuning_costs: cost of every tuner.
 
     Returns:
         Table with the columns `WINNER_COLUMNS`.

@@ -76,8 +76,8 @@ def format_explain_command(recordings: Iterable[object], settings: Mapping[str, 
     return words
 
 
-def format_repeated_explain_command(folder: Path) -> str:
-    """Build the command that reproduces an explanation, as far as its folder states it.
+def read_explain_command(folder: Path) -> str:
+    """Read the command that repeats an explanation from the record in its folder.
 
     Args:
         folder: Folder of an explanation, with the record of its settings and recordings.

@@ -120,25 +120,22 @@ def check_servo_stability(recording: Recording, kind: type[Simulator]) -> Iterat
         return
     # These imports are needed for robots only.
     from sims.robot.contact_pairs import iterate_poses
-    from sims.robot.servo_stability import UnstableServo, list_unstable_servos
+    from sims.robot.servo_stability import list_unstable_servos
 
     robot: Any = kind
     settings = robot.numerics
-    worst_by_name: dict[str, UnstableServo] = {}
-    for data in iterate_poses(kind, recording.runs[0].channels):
-        for servo in list_unstable_servos(robot.robot, settings, data):
-            worst = worst_by_name.get(servo.name)
-            if worst is None or servo.growth > worst.growth:
-                worst_by_name[servo.name] = servo
-    if not worst_by_name:
+    poses = iterate_poses(kind, recording.runs[0].channels)
+    unstable_servos = list_unstable_servos(robot.robot, settings, poses)
+    if not unstable_servos:
         return
-    stable_steps = [servo.stable_step for servo in worst_by_name.values() if servo.stable_step]
+    stable_steps = [servo.stable_step for servo in unstable_servos if servo.stable_step]
     remedy = "simulate with the integrator implicitfast"
-    if len(stable_steps) == len(worst_by_name):
+    if len(stable_steps) == len(unstable_servos):
         remedy += f" or with a time step of {1e3 * min(stable_steps):.3g} ms"
-    servos = "servo" if len(worst_by_name) == 1 else "servos"
+    servos = "servo" if len(unstable_servos) == 1 else "servos"
+    names = join_first_names(servo.name for servo in unstable_servos)
     yield Anomaly(
-        f"{servos} {join_first_names(sorted(worst_by_name))}: gains too large for "
+        f"{servos} {names}: gains too large for "
         f"{settings.integrator} steps of {1e3 * settings.timestep:.3g} ms: the simulation "
         f"oscillates from step to step, up to the force limit; {remedy}",
         False,

@@ -43,7 +43,7 @@ def read(tmp_path, text):
 def unstable(robot, integrator, step):
     data = mujoco.MjData(robot.compiled)
     mujoco.mj_forward(robot.compiled, data)
-    return list_unstable_servos(robot, IntegratorSettings(step, integrator), data)
+    return list_unstable_servos(robot, IntegratorSettings(step, integrator), [data])
 
 
 @pytest.mark.parametrize(
