@@ -56,6 +56,7 @@ from bench.diagnosis.search.lack_of_fit import list_hat_effects
 from bench.logs.quality.servo_checks import find_copied_commands
 from sims.core.user_messages import join_first_names
 from sims.recording.recording import Recording, Run
+from sims.robot.dynamics.linearisation_points import LINEARISATION_INTERVAL_SECONDS
 from sims.robot.robot_model import RobotModel
 from sims.robot.robot_simulator import RobotSimulator
 
@@ -97,6 +98,11 @@ PART_SAMPLES = 60
 """Number of samples of the part of a run on which hypotheses are compared."""
 PART_RUNS = 3
 """Maximum number of runs of which parts are used."""
+COARSE_JACOBIAN_SECONDS = 0.04
+"""Time in seconds for which a Jacobian is held while hypotheses are rejected on one run.
+
+A wrong convention changes forces far more than Jacobians change in this time.
+"""
 MAX_EVALUATIONS = 200
 """Number of filters after which no further hypothesis of one round is compared.
 
@@ -539,15 +545,24 @@ class ConventionComparison:
         Args:
             hypothesis: Difference between the conventions.
             recording: Recording as it is described, or with some conventions corrected.
-            run: Index of the only run to use; None for all runs of which parts are used.
+            run: Index of the only run to use; None for all runs of which parts are used. On one
+                run, hypotheses are only rejected, so that Jacobians are held longer.
         """
         self.evaluations += 1
         parts = self._select_segments(hypothesis.applied(recording), run)
-        followed = self._filter_runs(parts, max_linearisations=1)
+        jacobian_seconds = (
+            LINEARISATION_INTERVAL_SECONDS if run is None else COARSE_JACOBIAN_SECONDS
+        )
+        followed = self._filter_runs(
+            parts, max_linearisations=1, min_jacobian_seconds=jacobian_seconds
+        )
         return _get_log_likelihood(followed) + _compute_log_scale_correction([hypothesis], parts)
 
     def _filter_runs(
-        self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
+        self,
+        recording: Recording,
+        max_linearisations: int = MAX_LINEARISATIONS,
+        min_jacobian_seconds: float = LINEARISATION_INTERVAL_SECONDS,
     ) -> FollowedRuns:
         """Filter the runs for fitting with the parameters of the model file (Kalman filter).
 
@@ -557,6 +572,7 @@ class ConventionComparison:
         Args:
             recording: the recording, transformed by a hypothesis.
             max_linearisations: maximum number of linearisations about the smoothed motion.
+            min_jacobian_seconds: minimum time in seconds for which a Jacobian is held.
         """
         evaluator = self.subject.evaluator(recording)
         followed = FollowedRuns.follow(
@@ -564,6 +580,7 @@ class ConventionComparison:
             evaluator.get_nominal_theta(),
             _estimate_white_noise(evaluator, recording),
             max_linearisations=max_linearisations,
+            min_jacobian_seconds=min_jacobian_seconds,
         )
         evaluator.close()
         return followed

@@ -43,6 +43,7 @@ from sims.robot.dynamics.linearisation_about_recording import (
     SingleArray,
     Trajectory,
 )
+from sims.robot.dynamics.linearisation_points import LINEARISATION_INTERVAL_SECONDS
 from sims.robot.robot_simulator import RobotSimulator
 
 POSITION_PRIOR, VELOCITY_PRIOR = 1.0, 0.3
@@ -112,6 +113,7 @@ class FollowedRuns:
         trajectories: Sequence[Trajectory] | None = None,
         force: Array | None = None,
         max_linearisations: int = MAX_LINEARISATIONS,
+        min_jacobian_seconds: float = LINEARISATION_INTERVAL_SECONDS,
     ) -> FollowedRuns:
         """Linearise a model about the measured motion and filter the runs.
 
@@ -130,6 +132,7 @@ class FollowedRuns:
             force: (E,) initial standard deviations of the missing forces for the fit of the process
                 noise; None for a share of typical forces.
             max_linearisations: maximum number of linearisations if the motion is not given.
+            min_jacobian_seconds: minimum time in seconds for which a Jacobian is held.
 
         Returns:
             The filter with the highest log-likelihood. The first one, about the motion of the
@@ -158,6 +161,7 @@ class FollowedRuns:
                     trajectory=motion,
                     neighbour=neighbour,
                     first_state=first_state,
+                    min_jacobian_seconds=min_jacobian_seconds,
                 )
                 for run, (motion, neighbour, first_state) in enumerate(
                     zip(motions, neighbours, first_states, strict=True)
@@ -738,6 +742,7 @@ def linearise_run(
     reuses_jacobians: bool = True,
     reuses_loads: bool = False,
     first_state: FirstState | None = None,
+    min_jacobian_seconds: float = LINEARISATION_INTERVAL_SECONDS,
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion.
 
@@ -760,6 +765,7 @@ def linearise_run(
         reuses_loads: whether the forces that transmissions carry are taken from the neighbour, too.
         first_state: first state from which a robot on the ground is simulated; None for that of
             the readings.
+        min_jacobian_seconds: minimum time in seconds for which a Jacobian is held.
     """
     # Half of the states are positions, the others velocities.
     half = len(evaluator.state_names) // 2
@@ -785,6 +791,7 @@ def linearise_run(
         neighbour,
         reuses_jacobians=reuses_jacobians and not is_simulated,
         reuses_loads=reuses_loads,
+        min_jacobian_seconds=min_jacobian_seconds,
     )
 
 

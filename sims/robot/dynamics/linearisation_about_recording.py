@@ -117,13 +117,13 @@ class MeasuredLinear(RunLinearisation):
         nearby: MeasuredLinear | None = None,
         reuses_jacobians: bool = True,
         reuses_loads: bool = False,
+        min_jacobian_seconds: float = LINEARISATION_INTERVAL_SECONDS,
     ) -> None:
         """Linearise about the given motion, and compute its readings and the step of each sample.
 
         The derivatives of a step (Jacobians) are computed by differences, and held for one sample
-        interval, but not for less than `LINEARISATION_INTERVAL_SECONDS` or more than
-        `MAX_JACOBIAN_SECONDS`. With `nearby`, a model of a similar motion, most of this work is
-        saved.
+        interval, but not for more than `MAX_JACOBIAN_SECONDS` or less than a given time. With
+        `nearby`, a model of a similar motion, most of this work is saved.
 
         Args:
             simulator: simulator of the robot.
@@ -137,6 +137,7 @@ class MeasuredLinear(RunLinearisation):
             reuses_jacobians: whether its Jacobians are reused as well.
             reuses_loads: whether the loads of its transmissions are reused as well, unless an
                 active effect depends on them.
+            min_jacobian_seconds: minimum time in seconds for which a Jacobian is held.
         """
         self._trajectory, self._measured, self._nearby = trajectory, measured or {}, nearby
         self._reuses_loads = reuses_loads
@@ -145,7 +146,7 @@ class MeasuredLinear(RunLinearisation):
             self.quotients = nearby._tangent.quotients
         # Time in seconds for which the base class holds a Jacobian.
         spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
-        self.held = float(np.clip(spacing, LINEARISATION_INTERVAL_SECONDS, MAX_JACOBIAN_SECONDS))
+        self.held = max(min(spacing, MAX_JACOBIAN_SECONDS), min_jacobian_seconds)
         super().__init__(simulator, theta, scenario, *start)
         if self._sensor_channels:
             # The base class has stored the readings of the simulated motion. They are replaced by
