@@ -216,7 +216,8 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
     """Fit subsets of the effects of a result to runs with another step, and rate the best model.
 
     With another step, some effects may be needless, because they imitated the error of the step.
-    All subsets are fitted if there are only few effects; otherwise only all together.
+    All subsets are fitted if there are only few effects; otherwise only all together. Fits that
+    stay far behind the result are stopped early.
 
     Args:
         runs: the runs with the other step.
@@ -238,8 +239,13 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
                 indices = evaluator.coefficient_slices[omitted]
                 theta[indices] = evaluator.get_nominal_theta()[indices]
             starts.append(FitStart(subset, theta, fit.initial_states))
-    fits = TrajectoryFitter(evaluator, runs.noise, base.fixed_parameters).fit_models(
-        starts, MAX_ITERATIONS if has_few_effects else REFIT_ITERATIONS
+    fitter = TrajectoryFitter(evaluator, runs.noise, base.fixed_parameters)
+    fits = fitter.fit_models(
+        starts,
+        MAX_ITERATIONS if has_few_effects else REFIT_ITERATIONS,
+        is_racing=True,
+        # The readings are the same with both steps, so that the costs can be compared.
+        lowest_cost=fitter.compute_cost(fit),
     )
     search = runs.create_search(base)
     best = select_likeliest(*(search.add_fit(subset_fit) for subset_fit in fits))
