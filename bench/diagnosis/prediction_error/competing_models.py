@@ -276,7 +276,8 @@ def _find_better_competitor(context: SearchContext, best: FittedModel) -> Fitted
             confirmed = _confirm(context, best, competing_effect, start)
             starts += [confirmed] if confirmed is not None else []
     if starts:
-        search.refit_models(starts, is_racing=False)
+        # Fits that stay far behind the best model are no alternatives, and are stopped early.
+        search.refit_models(starts)
     # The fits are stored in `search.models`, from which the best model with as many effects is
     # taken at the end.
     size = len(best.effects)
