@@ -207,6 +207,31 @@ class TrajectoryFitter:
                         finished()
         return [fit_state.make_fit() for fit_state in fit_states]
 
+    def predict_costs(self, starts: Sequence[FitStart]) -> list[float]:
+        """Return the cost that the first step of each fit would reach if the model were linear.
+
+        This takes one simulation of the start and its derivatives. A fit from a start near the
+        optimum hardly reaches less than a small share of this cost.
+
+        Args:
+            starts: starts of the fits; one or more.
+
+        Returns:
+            Predicted costs, in the order of the starts; infinite if the simulation fails.
+        """
+        sample_mask = self.evaluator.get_sample_mask(self.share)
+        fit_states = [self._create_fit_state(start) for start in starts]
+        self._simulate_starts(fit_states, sample_mask)
+        predicted_costs = []
+        for fit_state in fit_states:
+            # This computes the predicted decrease, unless the simulation has failed.
+            self._propose_trial(fit_state, sample_mask)
+            cost = fit_state.point.cost
+            predicted_costs.append(
+                cost - fit_state.predicted_decrease if np.isfinite(cost) else np.inf
+            )
+        return predicted_costs
+
     def _list_worker_arguments(self) -> tuple[Any, ...]:
         """Return all fields except the run evaluator, which workers have already.
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 from itertools import combinations, tee
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
@@ -40,6 +43,10 @@ not show it, as a share of the residual.
 """
 MAX_SUBSET_EFFECTS = 3
 """Maximum number of effects of which all subsets are fitted with another time step."""
+HOPELESS_COST_RATIO = 3.0
+"""Minimum ratio of the cost that a linear model predicts with another step to the cost that this
+step needs at which it is not tried.
+"""
 REFIT_ITERATIONS = 8
 """Maximum number of steps of the fit of more effects with another time step."""
 
@@ -100,6 +107,11 @@ class TimeStepChoice:
             if runs.fitting.filtered_runs is None:
                 # A model that diverges with the file's step may be filtered with a finer one.
                 filter_simulated_runs(runs)
+            # Even the exact step would be hopeless then, as its motion is nearly the same.
+            max_rms = 1.0 + (1.0 - MIN_CLOSED_SHARE) * file_excess
+            max_cost = model.fit.fit.cost * (max_rms / (1.0 + file_excess)) ** 2
+            if not _list_hopeful(runs, [model.fit.fit.make_start()], model.fit, max_cost):
+                break
             finer = model.refit(runs)
             log_likelihood, residual_rms = finer.rate()
             gain = log_likelihood - file_log_likelihood
@@ -224,7 +236,8 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
         result: result of a search, whose fixed parameters stay fixed.
 
     Returns:
-        Penalised log-likelihood and excess RMS residual of the best model.
+        Penalised log-likelihood and excess RMS residual of the best model; minus infinity and
+        infinity if no model can come near the result.
     """
     names, fit = result.finding.model.effects, result.finding.model.fit
     evaluator, base = runs.fitting, result.searched_base.fit
@@ -240,6 +253,9 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
                 theta[indices] = evaluator.get_nominal_theta()[indices]
             starts.append(FitStart(subset, theta, fit.initial_states))
     fitter = TrajectoryFitter(evaluator, runs.noise, base.fixed_parameters)
+    starts = _list_hopeful(runs, starts, base, fitter.compute_cost(fit))
+    if not starts:
+        return -np.inf, np.inf
     fits = fitter.fit_models(
         starts,
         MAX_ITERATIONS if has_few_effects else REFIT_ITERATIONS,
@@ -250,6 +266,28 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
     search = runs.create_search(base)
     best = select_likeliest(*(search.add_fit(subset_fit) for subset_fit in fits))
     return rate_model(search, best)
+
+
+def _list_hopeful(
+    runs: SimulatedRuns, starts: Sequence[FitStart], base: BaseFit, max_cost: float
+) -> list[FitStart]:
+    """Return the starts whose fits with another step may reach a cost, by their linear models.
+
+    The error of a step is known from one simulation, and what parameters and first states can
+    compensate of it from the derivatives. Most steps are so rejected without a fit.
+
+    Args:
+        runs: the runs with the other step.
+        starts: fitted models with the present step.
+        base: base fit, whose fixed parameters stay fixed.
+        max_cost: cost that a model has to reach.
+    """
+    fitter = TrajectoryFitter(runs.fitting, runs.noise, base.fixed_parameters)
+    return [
+        start
+        for start, cost in zip(starts, fitter.predict_costs(starts), strict=True)
+        if not cost > HOPELESS_COST_RATIO * max_cost
+    ]
 
 
 def closes_gap_alone(gain: float, gap: float, remaining_gap: float) -> bool:

@@ -65,6 +65,21 @@ def test_parameters_and_initial_states_of_noiseless_runs_come_back(share):
     assert seen.sum() == pytest.approx((1 - share) * 560, abs=40)
 
 
+def test_the_linear_model_predicts_the_cost_that_a_fit_reaches():
+    """From the optimum of one noise, a start beside it is predicted to return there."""
+    there = evaluator(swings())
+    rng = np.random.default_rng(7)
+    there.observed[:] += 1e-3 * rng.standard_normal(there.observed.shape)
+    best = fitted(there)
+    beside = replace(best.make_start(), theta=best.theta * 1.001)
+    fitter = TrajectoryFitter(there, white(there, 1e-3))
+    (cost,) = fitter.predict_costs([beside])
+    (unfitted,) = fitter.fit_models([beside], iterations=0)
+    assert best.cost == pytest.approx(560, rel=0.15)
+    assert unfitted.cost > 1.5 * best.cost
+    assert cost == pytest.approx(best.cost, rel=0.02)
+
+
 def test_an_effect_is_fitted_with_the_parameters():
     made = recording(effects=["drag.linear=8e-4"], theta=["2.7e-3"], runs=2, seconds=1.5, rate=60)
     there = evaluator(made, candidates=["drag.linear", "friction.coulomb"])
