@@ -375,9 +375,9 @@ def _compute_residual(
 def _compute_cost(contacts: dict[_Key, _Contact], keys: list[_Key]) -> float:
     """Return the sum of squares of the residual of contact equilibrium.
 
-    The square of the acceleration of free fall, times the number of open contacts, is added, so
-    that closing a contact decreases the sum. If a contact does not exist at the state, the sum is
-    infinite.
+    The square of the acceleration of free fall is added for each open contact, so that closing one
+    decreases the sum, by the same amount whichever number is open. If a contact does not exist at
+    the state, the sum is infinite.
 
     Args:
         contacts: contacts at a state.
@@ -389,5 +389,5 @@ def _compute_cost(contacts: dict[_Key, _Contact], keys: list[_Key]) -> float:
     residual = _compute_residual(contacts, contacts, keys)
     open_count = sum(not contacts[key].is_closed for key in keys)
     # An open contact falls with the acceleration of gravity, 9.81 m/s^2.
-    falling = open_count * 9.81 / ACCELERATION_TOLERANCE
-    return float(residual @ residual + falling**2)
+    falling = 9.81 / ACCELERATION_TOLERANCE
+    return float(residual @ residual) + open_count * falling**2

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from sims.core.simulator import Scenario
-from sims.robot.dynamics.contact_equilibrium import ContactModel, settle_contacts
+from sims.robot.dynamics.contact_equilibrium import (
+    ContactModel,
+    _compute_cost,
+    _Contact,
+    settle_contacts,
+)
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator
@@ -94,6 +99,16 @@ def test_a_wheel_in_the_air_stays_where_it_was_measured(simulator):
     measured = np.array([0.0, 0.01, 0.2]), np.array([0.1, -0.5, 3.0])
     settled = settle(simulator, make_scenario(), measured)
     np.testing.assert_array_equal(np.concatenate(settled), np.concatenate(measured))
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_each_open_contact_costs_the_square_of_free_fall(count):
+    """Contacts that rest at the depth of 1e-4 m without force have only the cost of falling."""
+    still = _Contact(np.zeros(1), np.zeros(1), -1e-4, False, np.ones(1))
+    contacts = {(0, rim, 0): still for rim in range(1, count + 1)}
+    # The acceleration has a tolerance of 0.1 m/s^2.
+    expected = count * (GRAVITY / 0.1) ** 2
+    assert _compute_cost(contacts, list(contacts)) == pytest.approx(expected, rel=1e-9)
 
 
 def test_known_jacobians_of_contacts_save_evaluations(simulator, monkeypatch):

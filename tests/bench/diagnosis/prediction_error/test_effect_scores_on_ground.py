@@ -89,6 +89,7 @@ def test_a_planted_radius_explains_most_of_the_residual(scores):
     start = scores.simulations.refine(scores.list_starts()[0])
     assert start.effects == ("geom.radius@left_tyre",)
     (index,) = scores.context.evaluator.get_coefficient_indices("geom.radius@left_tyre")
-    assert start.theta[index] == pytest.approx(PLANTED, rel=0.05)
+    # The standard deviation over the noise of the recording is 5 %.
+    assert start.theta[index] == pytest.approx(PLANTED, rel=0.1)
     base_cost = scores.simulations.compute_cost(scores.context.filters.base.theta)
     assert scores.simulations.compute_cost(start.theta) < 0.2 * base_cost
