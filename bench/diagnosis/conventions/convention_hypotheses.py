@@ -255,10 +255,10 @@ def _generate_signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
     """
     positions = [joint.channels[q] for q in ("q", "qd") if q in joint.channels]
     groups = [positions, list(joint.inputs)]
-    # A reversed velocity alone, or torque alone. The only channel of a joint is in the first group
+    # A reversed velocity alone, or torque alone. A velocity without a position is the first group
     # already.
-    if len(joint.channels) > 1:
-        groups += [[joint.channels[q]] for q in ("qd", "tau") if q in joint.channels]
+    single_channels = [[joint.channels[q]] for q in ("qd", "tau") if q in joint.channels]
+    groups += [names for names in single_channels if names != positions]
     for names in groups:
         if names:
             text = f"the sign of {join_first_names(names, MAX_NAMED)} looks reversed"
