@@ -359,7 +359,7 @@ def fit_process_noise(
 
     Each iteration filters and smooths the runs, and multiplies each variance by the ratio of its
     smoothed to its expected square, eq. (7) of the module docstring. It ends when neither the
-    variances nor the likelihood change much.
+    variances nor the likelihood change much. The results are those of the returned deviations.
 
     Args:
         runs: the linear models.
@@ -377,7 +377,7 @@ def fit_process_noise(
     is_long = runs.residuals.shape[1] > 2 * SEGMENT_SAMPLES
     fitted_runs = runs.segments(SEGMENT_SAMPLES) if is_long else runs
     log_likelihood = -np.inf
-    for _ in range(MAX_ITERATIONS):
+    for iteration in range(MAX_ITERATIONS):
         filtered = filter_runs(fitted_runs, force, white)
         smoothed = smooth_runs(fitted_runs, filtered, force)
         last, log_likelihood = log_likelihood, float(filtered.log_likelihood.sum())
@@ -388,7 +388,9 @@ def fit_process_noise(
         ratio = np.clip(np.sqrt(smoothed.score[:count]), 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
         new_force = np.maximum(force * ratio, SMALLEST_FORCE * typical)
         has_converged = bool((np.abs(new_force / force - 1.0) < CONVERGENCE_TOLERANCE).all())
-        if has_converged:
+        # Short runs are not filtered again, so the last filter belongs to the present variances.
+        is_last_filter = not is_long and iteration == MAX_ITERATIONS - 1
+        if has_converged or is_last_filter:
             break
         force = new_force
     if is_long:

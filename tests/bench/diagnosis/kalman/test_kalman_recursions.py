@@ -5,7 +5,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.kalman import kalman_recursions
 from bench.diagnosis.kalman.kalman_recursions import (
+    SEGMENT_SAMPLES,
     LinearRuns,
     add_noise_states,
     filter_runs,
@@ -145,6 +147,19 @@ def test_the_process_noise_is_found_by_maximum_likelihood(begin):
         filter_runs(runs, force * factor, white).log_likelihood.sum() for factor in (0.6, 1.6)
     ]
     assert filtered.log_likelihood.sum() > max(around)
+
+
+@pytest.mark.parametrize("samples", [40, 4 * SEGMENT_SAMPLES])
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_the_process_noise_is_that_of_the_returned_filter(monkeypatch, samples, iterations):
+    """This holds for a fit that ends before it has converged, too."""
+    monkeypatch.setattr(kalman_recursions, "MAX_ITERATIONS", iterations)
+    rng = np.random.default_rng(7)
+    runs = runs_of(rng.normal(size=(3, samples, 1)))
+    white = np.array([SIGMA**2])
+    force, filtered, _ = fit_process_noise(runs, np.array([1e-3]), white, np.array([1.0]))
+    expected = filter_runs(runs, force, white).log_likelihood
+    np.testing.assert_allclose(filtered.log_likelihood, expected, rtol=1e-12)
 
 
 def test_no_process_noise_is_found_where_the_model_is_right():
