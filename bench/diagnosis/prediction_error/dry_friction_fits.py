@@ -213,13 +213,7 @@ def _find_soft_friction(context: SearchContext) -> FitStart | None:
     best_group = groups[friction_indices[0]]
     (coefficient,) = columns.solve_alone(regression, best_group)
     sign = float(np.copysign(1.0, coefficient))
-    # The search by filters is slow, so its results are cached by effect and sign.
-    cached_starts = context.filters.soft_friction
-    if (best_group.effect, sign) not in cached_starts:
-        cached_starts[best_group.effect, sign] = _search_soft_friction(
-            context.filters, best_group.effect, sign
-        )
-    return cached_starts[best_group.effect, sign]
+    return context.filters.get_soft_friction_start(best_group.effect, sign, _search_soft_friction)
 
 
 def _search_soft_friction(filters: ModelFilters, name: str, sign: float) -> FitStart | None:

@@ -7,7 +7,7 @@ them is simulated.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -77,25 +77,23 @@ class ModelFilters:
     Attributes:
         models: the base model and the fitted models.
         numerics: share of the integrator's step errors that the selection puts into the model.
-        soft_friction: likeliest models of soft dry friction by effect and sign, which
-            `dry_friction_fits` caches here.
     """
 
     models: ScoredModelSet
     numerics: float = 0.0
-    soft_friction: dict[tuple[str, float], FitStart | None] = field(default_factory=dict)
     _filters_by_theta: dict[bytes, FollowedRuns] = field(default_factory=dict)
     _newest_by_effects: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
     _newest_about_base: FollowedRuns | None = None
     _likelihoods: dict[tuple[bytes, bool], float] = field(default_factory=dict)
+    _soft_friction_starts: dict[tuple[str, float], FitStart | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.evaluator, self.noise = self.models.evaluator, self.models.noise
 
     def take_over(self, other: ModelFilters) -> None:
-        """Reuse the likelihoods that another search of the same models has computed."""
+        """Reuse likelihoods and soft friction that another search of the same models has found."""
         self._likelihoods = other._likelihoods
-        self.soft_friction = other.soft_friction
+        self._soft_friction_starts = other._soft_friction_starts
 
     @cached_property
     def reference(self) -> Array:
@@ -244,6 +242,24 @@ class ModelFilters:
         followed = self.base.with_parameters(theta, self._soft_simulator, similar)
         self._likelihoods[theta.tobytes(), True] = followed.log_likelihood
         return followed
+
+    def get_soft_friction_start(
+        self, name: str, sign: float, search: Callable[[ModelFilters, str, float], FitStart | None]
+    ) -> FitStart | None:
+        """Return the likeliest model of soft dry friction at a joint; it is cached.
+
+        A search compares several filters, which is slow. Its result is stored by effect and sign,
+        also if it is None, and other searches of the same models reuse it (`take_over`).
+
+        Args:
+            name: name of a friction effect at a joint.
+            sign: 1 for more friction than in the model file, -1 for less.
+            search: function that finds the model for these filters, the name and the sign.
+        """
+        key = name, sign
+        if key not in self._soft_friction_starts:
+            self._soft_friction_starts[key] = search(self, name, sign)
+        return self._soft_friction_starts[key]
 
     def _follow_about_base(self, theta: Array) -> FollowedRuns:
         """Follow the runs with other parameters, linearised about the motion of the base model.
