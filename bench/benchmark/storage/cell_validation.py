@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from bench.benchmark.storage.table_schemas import Columns, ColumnSpec, EmptyCellRule
 from sims.core.files import get_first_line
+from sims.core.simulator import InputError
 from sims.core.toml_validation import format_value
 
 if TYPE_CHECKING:
@@ -38,6 +40,20 @@ class CellError(Exception):
         self.row = row
         self.says = f"{column}: expected {expected}, found {found}"
         super().__init__(self.says)
+
+
+def make_table_error(path: Path, place: str, problem: str, remedy: str) -> InputError:
+    """Make the one-line error for a damaged table file.
+
+    Args:
+        path: The file.
+        place: Where it is damaged, in the words of its format, such as ``line 3``; empty for the
+            whole file.
+        problem: What is wrong.
+        remedy: Advice for a damaged file.
+    """
+    subject = f"{path}, {place}" if place else str(path)
+    return InputError(f"{subject}: {problem}; {remedy}")
 
 
 def select_declared_columns(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from bench.benchmark.storage.cell_validation import (
     CellError,
     check_cells,
+    make_table_error,
     parse_csv_column,
     select_declared_columns,
 )
@@ -61,8 +62,12 @@ class CsvTable:
             row: Row, or None for the file.
             problem: What is wrong.
         """
-        line = "" if row is None else f", line {self._get_line_number(row)}"
-        return InputError(f"{self._path}{line}: {problem}; {self._remedy}")
+        return self._make_line_error(None if row is None else self._get_line_number(row), problem)
+
+    def _make_line_error(self, line: int | None, problem: str) -> InputError:
+        """Make the error for a line of the file, counted from 1, or for the whole file."""
+        place = "" if line is None else f"line {line}"
+        return make_table_error(self._path, place, problem, self._remedy)
 
     def _read_text(self) -> str:
         """Read the file as text, without the byte order mark that Excel writes at the beginning.
@@ -70,19 +75,19 @@ class CsvTable:
         Raises:
             InputError: the file is missing, empty or not UTF-8.
         """
-        problem = f"{self._path}: not a complete comparison"
+        problem = "not a complete comparison"
         try:
             file_content = self._path.read_bytes()
         except OSError as error:
-            raise InputError(f"{problem}: {error.strerror}; {self._remedy}") from None
+            raise self.make_error(None, f"{problem}: {error.strerror}") from None
         if not file_content.strip():
-            raise InputError(f"{problem}: expected a CSV file, found an empty one; {self._remedy}")
+            raise self.make_error(None, f"{problem}: expected a CSV file, found an empty one")
         try:
             return file_content.decode("utf-8-sig")
         except UnicodeDecodeError as error:
             line = file_content[: error.start].count(b"\n") + 1
             reason = f"expected UTF-8 text, found byte {file_content[error.start]:#04x}"
-            raise InputError(f"{self._path}, line {line}: {reason}; {self._remedy}") from None
+            raise self._make_line_error(line, reason) from None
 
     def _convert_columns(self, columns: Columns) -> pa.Table:
         """Convert the cells of the declared columns from text to their types, and check them.
@@ -132,7 +137,7 @@ class CsvTable:
         for number, cells in self._iterate_records():
             if len(cells) != len(self._header):
                 reason = f"expected {len(self._header)} cells, found {len(cells)}"
-                raise InputError(f"{self._path}, line {number}: {reason}; {self._remedy}")
+                raise self._make_line_error(number, reason)
 
     def _iterate_records(self) -> Iterator[tuple[int, list[str]]]:
         """Yield the cells of every record with its first line number, without blank lines.
@@ -148,9 +153,7 @@ class CsvTable:
                     yield first_line, cells
                 first_line = reader.line_num + 1
         except csv.Error as error:
-            raise InputError(
-                f"{self._path}, line {first_line}: expected cells, found {error}; {self._remedy}"
-            ) from None
+            raise self._make_line_error(first_line, f"expected cells, found {error}") from None
 
     def _get_line_number(self, row: int) -> int:
         """Return the line number of a row; the first record is the header."""

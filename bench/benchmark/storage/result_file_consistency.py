@@ -19,6 +19,7 @@ from bench.benchmark.storage.cell_validation import (
     CellError,
     Mask,
     check_cells,
+    make_table_error,
     parse_parquet_column,
     select_declared_columns,
     to_numpy_mask,
@@ -213,8 +214,8 @@ class RunsTable(NamedTuple):
             row: Row, or None for the file.
             problem: What is wrong.
         """
-        row_text = "" if row is None else f", row {self.first_row + row}"
-        return InputError(f"{self.path}{row_text}: {problem}; {self.remedy}")
+        place = "" if row is None else f"row {self.first_row + row}"
+        return make_table_error(self.path, place, problem, self.remedy)
 
     def read_runs(self, experiment: Experiment) -> pd.DataFrame:
         """Check all rows, and return one line per run, in the order of the file.
@@ -252,7 +253,7 @@ class RunsTable(NamedTuple):
         reason = (
             "no such file" if missing else f"expected a Parquet file, found {get_first_line(error)}"
         )
-        return InputError(f"{self.path}: not a complete comparison: {reason}; {self.remedy}")
+        return self.make_error(None, f"not a complete comparison: {reason}")
 
 
 def _read_checked_runs(
