@@ -120,38 +120,14 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> list[str]:
     return _write("caveats", report)
 
 
-def format_gain(report: DiagnosisReportData) -> str:
-    """Format the held-out error before and after, and the noise floor.
-
-    The noise floor is the error of a perfect model. Without held-out runs, the text says that the
-    gain was not measured.
-    """
-    return _write_one("gain", report)
-
-
 def format_early_stop(report: DiagnosisReportData) -> str:
     """Format why the search stopped early and which questions it skipped; empty if complete."""
     return _write_one("early_stop", report)
 
 
-def format_detectable_gap(report: DiagnosisReportData) -> str:
-    """Format how large a gap the noise could hide in each channel."""
-    return _write_one("detectable_gap", report)
-
-
 def format_coefficients(cause: Cause) -> str:
     """Format a cause's coefficients with intervals, its p-value, and its alternatives."""
     return _write_one("coefficients", cause)
-
-
-def format_parameter_shifts(report: DiagnosisReportData) -> str:
-    """Format how far the parameters move once the causes are in the model."""
-    return _write_one("parameter_shifts", report)
-
-
-def format_parameter_shift(report: DiagnosisReportData, p: ParameterChange) -> str:
-    """Format how far a parameter moves once the cause is in the model."""
-    return _write_one("parameter_shift", report, p)
 
 
 def format_interval(held_out: HeldOutResult) -> str:

@@ -17,8 +17,6 @@ from bench.diagnosis.extended_robot_files import select_written_causes
 from bench.diagnosis.report.report_data import ParameterChange
 from bench.diagnosis.report.summary_text import (
     format_headline,
-    format_parameter_shift,
-    format_parameter_shifts,
     format_shift,
     format_summary,
     has_absorbed_gap,
@@ -211,9 +209,17 @@ def test_a_partial_verdict_for_a_bound_says_which():
     assert "coefficient 4 s (upper bound of its range)" in said
 
 
+def get_parameter_text(*changes):
+    """Return the paragraph on the parameters in the summary of one cause."""
+    report = replace(make_report("named", causes=[DRAG]), parameters=list(changes))
+    paragraphs = "\n".join(format_summary(report)).split("\n\n")
+    (paragraph,) = [text for text in paragraphs if text.startswith("Parameters: ")]
+    return " ".join(paragraph.split()).removeprefix("Parameters: ")
+
+
 def test_a_parameter_at_its_bound_is_said_to_be_there():
     p = ParameterChange("mass", "kg", (1.0, 0.9, 1.1), (10.0, np.nan, np.nan), True, (None, "high"))
-    assert "10 kg (upper bound of its range) after" in format_parameter_shift(make_report(), p)
+    assert "10 kg (upper bound of its range) after" in get_parameter_text(p)
 
 
 def test_many_parameters_are_listed_without_intervals():
@@ -225,10 +231,8 @@ def test_many_parameters_are_listed_without_intervals():
     mass = ParameterChange(
         "mass", "kg", (1.0, 0.9, 1.1), (9.0, np.nan, np.nan), True, (None, "high")
     )
-    report = make_report("named", causes=[DRAG])
-    three = format_parameter_shifts(replace(report, parameters=[stiff, still, mass]))
-    assert three.count("before") == 3
-    four = format_parameter_shifts(replace(report, parameters=[stiff, still, still, mass]))
+    assert get_parameter_text(stiff, still, mass).count("before") == 3
+    four = get_parameter_text(stiff, still, still, mass)
     assert four == (
         "2 of 4 had absorbed part of the gap (before → after): kp −0.3 → 0.05, in the model file "
         "20 → 21 N·m/rad; kv 0.1 → 0.1; kv 0.1 → 0.1; mass 1 → 9 kg (upper bound of its range)."
@@ -266,7 +270,7 @@ def test_nothing_of_a_number_at_a_bound_is_written_into_a_model_file():
 )
 def test_a_parameter_absorbs_what_is_significant(before, after, absorbed):
     p = ParameterChange("inertia", "kg*m^2", before, after, True)
-    said = format_parameter_shift(make_report(), p)
+    said = get_parameter_text(p)
     assert has_absorbed_gap(p) is absorbed
     assert ("absorbed part of the gap" in said) is absorbed
     assert "(0.0 %)" not in said

@@ -21,7 +21,6 @@ from bench.diagnosis.report.cause_and_value_text import (
 from bench.diagnosis.report.diagnosed_places import list_place_marks
 from bench.diagnosis.report.report_data import ChannelInfo
 from bench.diagnosis.report.summary_text import (
-    format_detectable_gap,
     format_gain_and_caveats,
     format_headline,
     format_summary,
@@ -240,7 +239,7 @@ def test_what_an_effect_does_is_said_without_its_place():
 
 def test_of_many_channels_the_worst_of_each_kind_is_said():
     told = make_robot_report("adequate", causes=())
-    assert format_detectable_gap(told).count(" of its noise") == 2
+    assert " ".join(format_gain_and_caveats(told)).count(" of its noise") == 2
     few = replace(
         told,
         channels=(
@@ -248,7 +247,7 @@ def test_of_many_channels_the_worst_of_each_kind_is_said():
             *(ChannelInfo(f"x{i}", "m", 1.0, True, 0.0) for i in range(10)),
         ),
     )
-    assert format_detectable_gap(few).count("in x") == 10
+    assert " ".join(format_gain_and_caveats(few)).count("in x") == 10
     assert "Correcting it closes" in " ".join(
         format_gain_and_caveats(make_robot_report(causes=[HEAVY]))
     )
