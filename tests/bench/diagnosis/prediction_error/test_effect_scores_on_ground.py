@@ -30,11 +30,11 @@ in front of it touches the floor.
 """
 
 
-def write_recording(folder: Path) -> Path:
+def write_recording(folder: Path, seed: int = 0) -> Path:
     """Write runs straight on and with turns, simulated by plain MuJoCo; run 2 is held out."""
     model = mujoco.MjModel.from_xml_string(ROVER)
     model.geom("left_tyre").size[0] *= 1.0 + PLANTED
-    rng, runs, times = np.random.default_rng(0), [], np.arange(101) / 100
+    rng, runs, times = np.random.default_rng(seed), [], np.arange(101) / 100
     turns = SPEED + np.sin(2 * np.pi * np.outer(times, (1.3, 2.1))) * 3.0
     straight = np.full((101, 2), SPEED)
     for commands in (straight, 0.7 * straight, turns, turns[:, ::-1]):
@@ -50,12 +50,16 @@ def write_recording(folder: Path) -> Path:
     return write_log(folder, description, columns, runs, robot=ROVER)
 
 
-@pytest.fixture(scope="module")
-def scores(tmp_path_factory):
-    path = write_recording(tmp_path_factory.mktemp("rover"))
+def score(folder, seed=0):
+    path = write_recording(folder, seed)
     runs = prepare_runs([path], DiagnosisContext(ExplainOptions(), ForkedWorkerPool(1)))
     search = runs.create_search(filter_and_fit(runs).fit, runs.make_rng())
     return OutputErrorScores(SearchContext.of(search))
+
+
+@pytest.fixture(scope="module")
+def scores(tmp_path_factory):
+    return score(tmp_path_factory.mktemp("rover"))
 
 
 def test_the_response_to_a_radius_is_that_of_rolling(scores):
@@ -85,11 +89,18 @@ def test_the_response_to_a_radius_is_that_of_rolling(scores):
     assert response[:, z].mean() == pytest.approx(RAISED * RADIUS / 2, rel=0.15)
 
 
-def test_a_planted_radius_explains_most_of_the_residual(scores):
-    start = scores.simulations.refine(scores.list_starts()[0])
-    assert start.effects == ("geom.radius@left_tyre",)
-    (index,) = scores.context.evaluator.get_coefficient_indices("geom.radius@left_tyre")
-    # The standard deviation over the noise of the recording is 5 %.
-    assert start.theta[index] == pytest.approx(PLANTED, rel=0.1)
-    base_cost = scores.simulations.compute_cost(scores.context.filters.base.theta)
-    assert scores.simulations.compute_cost(start.theta) < 0.2 * base_cost
+def test_a_planted_radius_explains_most_of_the_residual(tmp_path):
+    """The standard deviation over the noise of a recording is 5 %, that of the mean 2.5 %."""
+    estimates = []
+    for seed in range(4):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        scores = score(folder, seed)
+        start = scores.simulations.refine(scores.list_starts()[0])
+        assert start.effects == ("geom.radius@left_tyre",)
+        (index,) = scores.context.evaluator.get_coefficient_indices("geom.radius@left_tyre")
+        estimates.append(start.theta[index])
+        base_cost = scores.simulations.compute_cost(scores.context.filters.base.theta)
+        assert scores.simulations.compute_cost(start.theta) < 0.2 * base_cost
+    assert np.mean(estimates) == pytest.approx(PLANTED, rel=0.05)
+    assert estimates == pytest.approx([PLANTED] * 4, rel=0.15)
