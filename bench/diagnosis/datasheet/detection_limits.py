@@ -237,12 +237,13 @@ def compute_detection_limits(
 def _add_small_gaps(
     evaluator: RunEvaluator, fit: TrajectoryFit, directions: DirectionSet
 ) -> DirectionSet:
-    """Add directions of backlash of an input (or a dead band, or a limit) below the tried sizes.
+    """Add directions of backlash below the tried sizes, of an input or a robot's transmission.
 
-    A direction is the change of the runs by an effect. These effects are not linear in their size,
-    so each size is simulated. If the smallest backlash that the search tries is detectable, smaller
-    ones may be, too, and the detection limit would be unknown. Each further size is half the
-    previous one, `GAP_HALVINGS` times.
+    Dead bands and limits of an input or a servo error are included. A direction is the change of
+    the runs by an effect. These effects are not linear in their size, so each size is simulated. If
+    the smallest backlash that the search tries is detectable, smaller ones may be, too, and the
+    detection limit would be unknown. Each further size is half the previous one, `GAP_HALVINGS`
+    times.
 
     Args:
         evaluator: evaluator that simulates the recorded runs for any parameters and effects.
@@ -250,22 +251,28 @@ def _add_small_gaps(
         directions: directions of all candidates.
     """
     # A probe is an effect with given coefficients; its direction is valid only at this size if
-    # `is_single_size`. Backlash and dead bands have one coefficient, their size.
-    smallest_probes: dict[str, CandidateDirection] = {}
+    # `is_single_size`. The first coefficient is the size, and the others are the shape, such as the
+    # share of the inertia of a rotor: each shape has a smallest size of its own.
+    smallest_probes: dict[tuple[str, bytes], CandidateDirection] = {}
     for probe in directions.candidates:
-        # Whether the size is one of an input or a servo error, such as a dead band. The other
-        # kinds, for example rate limits and compliances, are only tried at the sizes of the search.
-        is_input_level = (
-            probe.is_single_size
-            and evaluator.available_effects[probe.effect].coefficients[0].of
-            not in NONLINEAR_COEFFICIENT_KINDS
+        kind = evaluator.available_effects[probe.effect].coefficients[0].of
+        # Whether the effect vanishes with its size. Backlash of a transmission does so in a robot,
+        # where the flanks are rigid; in a system they are springs, which remain at any gap. The
+        # other kinds, for example rate limits and compliances, are only tried at the sizes of the
+        # search.
+        vanishes = kind not in NONLINEAR_COEFFICIENT_KINDS or (
+            kind == "travel" and evaluator.kind.has_model
         )
-        smallest = smallest_probes.get(probe.effect)
+        key = probe.effect, probe.coefficients[1:].tobytes()
+        smallest = smallest_probes.get(key)
         is_smaller = smallest is None or probe.coefficients[0] < smallest.coefficients[0]
-        if is_input_level and is_smaller:
-            smallest_probes[probe.effect] = probe
+        if probe.is_single_size and vanishes and is_smaller:
+            smallest_probes[key] = probe
     smaller_probes = [
-        replace(probe, coefficients=probe.coefficients * 0.5**halvings)
+        replace(
+            probe,
+            coefficients=np.append(probe.coefficients[0] * 0.5**halvings, probe.coefficients[1:]),
+        )
         for probe in smallest_probes.values()
         for halvings in range(1, GAP_HALVINGS + 1)
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bench.core.plugin_registries import make_robot_simulator
@@ -68,6 +69,17 @@ def test_what_may_be_nothing_at_a_joint_of_a_family_is_not_shown_there(arm_log: 
     assert friction.state == "not shown"
     assert friction.detection_limit is not None
     assert friction.detection_limit.size == pytest.approx(0.004)
+
+
+def test_backlash_of_a_joint_shows_below_the_sizes_that_the_search_tries() -> None:
+    """The smallest backlash of the search is 1 % of the travel, and half of it is detectable."""
+    log = EXAMPLE / "log.csv"
+    recording, _ = load_joined([log])
+    travel = max(np.ptp(run.channels["q.elbow"]) for run in recording.training())
+    limit = row(build_sheet(log, "elbow"), "joint.backlash@elbow").detection_limit
+    assert limit is not None
+    assert limit.limit == "above"
+    assert limit.size == pytest.approx(0.01 * travel / 2.0, rel=1e-6)
 
 
 def test_a_joint_has_to_be_named_where_there_are_several() -> None:
