@@ -77,25 +77,36 @@ class ResponseProducts:
     """
 
     def __init__(
-        self, responses: Sequence[NDArray[np.floating]], innovations: Sequence[Array]
+        self,
+        responses: Sequence[NDArray[np.floating]],
+        innovations: Sequence[Array],
+        known: ResponseProducts | None = None,
     ) -> None:
         """Compute the products with the innovations, and the sums of squares of the columns.
 
-        Products of columns with each other are computed later, when they are needed.
+        Products of columns with each other are computed later, when they are needed. They do not
+        depend on the innovations.
 
         Args:
             responses: whitened responses W (N, K) of each run: K columns of N samples.
             innovations: whitened innovations e (N,) of each run.
+            known: products of the same responses with other innovations, if there are any; those of
+                columns with each other are shared.
         """
         self._responses, self._innovations = responses, innovations
-        count = responses[0].shape[1]
-        self.squares = np.zeros((len(responses), count))
-        self.crosses = np.zeros((len(responses), count))
         self.totals = np.array([float(e @ e) for e in innovations])
+        shape = len(responses), responses[0].shape[1]
+        self.crosses = np.zeros(shape)
+        self.squares: Array = np.zeros(shape) if known is None else known.squares
         for run, samples, block in self._iterate_blocks():
-            self.squares[run] += np.einsum("sk,sk->k", block, block)
             self.crosses[run] += innovations[run][samples] @ block
-        self._known_rows: dict[int, Array] = {}
+            if known is None:
+                self.squares[run] += np.einsum("sk,sk->k", block, block)
+        # Products (K,) of a column with all others, and products within groups by their columns.
+        self._known_rows: dict[int, Array] = {} if known is None else known._known_rows
+        self._known_groups: dict[tuple[int, bytes], Array] = (
+            {} if known is None else known._known_groups
+        )
 
     def _iterate_blocks(self) -> Iterator[tuple[int, slice, Array]]:
         """Iterate over the run, the samples and the responses (s, K) of all blocks of samples."""
@@ -134,9 +145,18 @@ class ResponseProducts:
     def sum_within(self, groups: IndexArray) -> Array:
         """Return the products (n, k, k) within n groups of k columns, summed over all runs.
 
+        Known products are reused, because several regressions have the same groups.
+
         Args:
             groups: (n, k) indices of the columns of each group.
         """
+        key = groups.shape[1], groups.tobytes()
+        if key not in self._known_groups:
+            self._known_groups[key] = self._compute_within(groups)
+        return self._known_groups[key]
+
+    def _compute_within(self, groups: IndexArray) -> Array:
+        """Return the products (n, k, k) within groups that are not known yet."""
         group_count, size = groups.shape
         result = np.zeros((group_count, size, size))
         # The sums of squares are known.
@@ -163,7 +183,4 @@ class ResponseProducts:
             e + responses[:, column]
             for responses, e in zip(self._responses, self._innovations, strict=True)
         ]
-        products = ResponseProducts(self._responses, innovations)
-        # Products of columns with columns do not depend on the innovations.
-        products._known_rows = self._known_rows
-        return products
+        return ResponseProducts(self._responses, innovations, known=self)
