@@ -129,8 +129,8 @@ MIN_INCOMPLETE_SHARE = 0.6
 """Minimum share of the joints of a real arm whose servo or friction the model lacks."""
 MIN_STATE_GAIN = 3.0
 """Minimum decrease of the cost, in units of the noise, by a fit of first states alone."""
-SLOW_TEST_STEPS = 4
-"""Maximum number of steps of the fit that tests an effect that is slow to simulate."""
+FIRST_TEST_STEPS = 4
+"""Maximum number of steps of the first fit that tests an effect."""
 TRIED_SHARES = (1.0, 0.5)
 """Shares of the regression coefficients with which a filter must follow the runs better."""
 
@@ -539,46 +539,73 @@ class PredictionErrorSearch(EffectSearch):
     def compute_p_value_of_missing_effect(self, model: FittedModel) -> float:
         """Return the p-value of the most significant effect that a fitted model lacks.
 
-        Three tests are made, each slower and more accurate:
+        Four tests are made, each slower and more accurate:
 
         1. linear regression of the innovations, which also chooses the effect;
-        2. a filter with the effect in its model, at a few shares of the coefficient;
-        3. a fit by simulation, of few steps if the effect is slow to simulate.
+        2. a few steps of a fit by simulation, unless the effect is slow to simulate;
+        3. a filter with the effect in its model, at a few shares of the coefficient;
+        4. a fit by simulation, of few steps if the effect is slow to simulate.
 
         The p-value of the first test that is not significant is returned, or that of the last one.
-        In the tests 2 and 3, the gain of the effect in twice the log-likelihood has a chi-squared
+        In the tests 2 to 4, the gain of the effect in twice the log-likelihood has a chi-squared
         law, and the p-value is multiplied by the number of effects in the library (Bonferroni
         correction).
 
         Args:
             model: the fitted model; only the first test is made if its simulation fails.
         """
+        # 1. Regression.
         scores = self.score_missing_effects(model)
         if scores.p_value > EFFECT_P_VALUE_THRESHOLD or not np.isfinite(model.fit.cost):
             return scores.p_value
-        filters = self._search_context.filters
-        columns = self._search_context.columns
         name = scores.effects[0]
         # The best shape of the best effect.
         (group, solution), *_ = scores.peaks[0]
-        coefficients = columns.coefficients(group, solution)
+        coefficients = self._search_context.columns.coefficients(group, solution)
         start = add_effect_to_start(self.evaluator, model.fit.make_start(), name, coefficients)
-        indices = self.evaluator.get_coefficient_indices(name)
+        count = len(self.evaluator.get_coefficient_indices(name))
         library_size = len(self.evaluator.library)
-        # A filter with the effect in the model is faster than a fit, and not linear in the effect.
+        is_slow = is_slow_to_simulate(self._search_context, [name])
+
+        def compute_p_value_of_fit(iterations: int) -> float:
+            """Return the p-value of the gain by a fit with a maximum number of steps."""
+            gain = self.fit_one(start, iterations).likelihood.value - model.likelihood.value
+            return compute_p_value_of_gain(gain, count, library_size)
+
+        # 2. First steps of a fit.
+        if not is_slow:
+            p_value = compute_p_value_of_fit(FIRST_TEST_STEPS)
+            if p_value > EFFECT_P_VALUE_THRESHOLD:
+                return p_value
+        # 3. Filters.
+        p_value = compute_p_value_of_gain(
+            self._compute_filter_gain(model, start, name), count, library_size
+        )
+        if p_value > EFFECT_P_VALUE_THRESHOLD:
+            return p_value
+        # 4. Fit.
+        return compute_p_value_of_fit(FIRST_TEST_STEPS if is_slow else MAX_ITERATIONS)
+
+    def _compute_filter_gain(self, model: FittedModel, start: FitStart, name: str) -> float:
+        """Return the largest gain of a filter by an effect, at a few shares of its coefficients.
+
+        Args:
+            model: the model without the effect.
+            start: the model with the effect.
+            name: name of the effect.
+
+        Returns:
+            The gain in twice the log-likelihood of the innovations.
+        """
+        filters = self._search_context.filters
+        indices = self.evaluator.get_coefficient_indices(name)
         log_likelihood = filters.get_filter(model).log_likelihood
         gains = []
         for share in TRIED_SHARES:
             theta = start.theta.copy()
             theta[indices] *= share
             gains.append(2.0 * (filters.log_likelihood(theta) - log_likelihood))
-        p_value_by_filter = compute_p_value_of_gain(max(gains), len(indices), library_size)
-        if p_value_by_filter > EFFECT_P_VALUE_THRESHOLD:
-            return p_value_by_filter
-        is_slow = is_slow_to_simulate(self._search_context, [name])
-        larger = self.fit_one(start, SLOW_TEST_STEPS if is_slow else MAX_ITERATIONS)
-        gain = larger.likelihood.value - model.likelihood.value
-        return compute_p_value_of_gain(gain, len(indices), library_size)
+        return max(gains)
 
     def score_missing_effects(
         self,
