@@ -66,15 +66,15 @@ def test_parameters_and_initial_states_of_noiseless_runs_come_back(share):
 
 
 def test_the_linear_model_predicts_the_cost_that_a_fit_reaches():
-    """From the optimum of one noise, a start beside it is predicted to return there."""
+    """x is predicted to return there."""
     there = evaluator(swings())
     rng = np.random.default_rng(7)
     there.observed[:] += 1e-3 * rng.standard_normal(there.observed.shape)
     best = fitted(there)
-    beside = replace(best.make_start(), theta=best.theta * 1.001)
+    nearby = replace(best.make_start(), theta=best.theta * 1.001)
     fitter = TrajectoryFitter(there, white(there, 1e-3))
-    (cost,) = fitter.predict_costs([beside])
-    (unfitted,) = fitter.fit_models([beside], iterations=0)
+    (cost,) = fitter.predict_costs([nearby])
+    (unfitted,) = fitter.fit_models([nearby], iterations=0)
     assert best.cost == pytest.approx(560, rel=0.15)
     assert unfitted.cost > 1.5 * best.cost
     assert cost == pytest.approx(best.cost, rel=0.02)
