@@ -66,7 +66,7 @@ def test_parameters_and_initial_states_of_noiseless_runs_come_back(share):
 
 
 def test_the_linear_model_predicts_the_cost_that_a_fit_reaches():
-    """x is predicted to return there."""
+    """Close to the optimum of noisy runs, the first step is predicted to return there."""
     there = evaluator(swings())
     rng = np.random.default_rng(7)
     there.observed[:] += 1e-3 * rng.standard_normal(there.observed.shape)
