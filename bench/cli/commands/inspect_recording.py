@@ -83,6 +83,7 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     from bench.figures.recording_figure import write_recording_figure
     from bench.logs import recording_summary
     from bench.logs.quality.log_quality import check_log_quality
+    from bench.logs.quality.pose_checks import find_missing_base_poses
     from bench.logs.recording_loading import load_recording
     from bench.logs.recording_summary import format_summary
     from sims.core.simulator import InputError
@@ -98,7 +99,18 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     findings = list(check_log_quality(recording, kind))
     active_recording, inactive = _remove_inactive_drives(recording, kind)
     findings += inactive
-    differences, settings_to_fix = _find_differing_conventions(options, active_recording, kind)
+    differences: list[ConventionDifference] = []
+    settings_to_fix: list[str] = []
+    missing_poses = [anomaly.text for anomaly in find_missing_base_poses(recording, kind)]
+    if missing_poses:
+        if options.fix:
+            raise InputError(f"{options.recording}: {missing_poses[0]}")
+        warnings_to_print.append(
+            "the conventions of the log are not compared with those of the model file, because an "
+            "initial pose is missing"
+        )
+    else:
+        differences, settings_to_fix = _find_differing_conventions(options, active_recording, kind)
     for line in (
         *robot_lines,
         *format_summary(recording, kind),

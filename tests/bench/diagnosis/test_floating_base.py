@@ -143,6 +143,23 @@ def test_where_it_begins_is_asked_for_in_one_line(name, tmp_path):
     assert "\n" not in str(raised.value)
 
 
+def test_conventions_are_compared_once_a_pose_is_stated(tmp_path):
+    """The axis of the boom is reversed in the log."""
+    reversed_axis = TOML.replace("noise = 0.001", "noise = 0.001\nscale = -1.0")
+    reversed_axis = reversed_axis.replace('unit = "N*m"', 'unit = "N*m"\nscale = -1.0')
+    path = recorded(tmp_path, reversed_axis)
+    output = run_command("inspect", path, "--out", tmp_path / "out").out
+    assert "run 1: the log does not state where base begins" in output
+    assert "conventions of the log are not compared" in output
+    assert "convention:" not in output
+    error = run_command("inspect", path, "--fix", tmp_path / "fixed.toml", code=2).err
+    assert "state [runs.1.initial]" in error
+    assert not (tmp_path / "fixed.toml").exists()
+    path.with_suffix(".toml").write_text(reversed_axis + STATED)
+    output = run_command("inspect", path, "--out", tmp_path / "out").out
+    assert "conventions of the log are not compared" not in output
+
+
 def test_a_simulated_log_says_where_its_runs_began(tmp_path):
     (tmp_path / "satellite.xml").write_text(MODEL)
     given = ["simulate", "--model", str(tmp_path / "satellite.xml"), "--runs", "2"]
