@@ -1,8 +1,8 @@
 """Stability of servos at the time step of a simulation.
 
-MuJoCo's integrator `Euler` takes the force of a servo from the state at the begin of a step; only
-the damping b of a joint is implicit. With position gain k and velocity gain d, the inertia m that
-the servo moves, and the step h, small motions of its length q follow
+MuJoCo's integrator `Euler` takes the force of a servo from the state at the beginning of a step;
+only the damping b of a joint is implicit. With position gain k and velocity gain d, the inertia m
+that the servo moves, and the step h, small motions of its length q follow
 
     v' = ((m - h d) v - h k q) / (m + h b),    q' = q + h v'               (1)
 
@@ -33,7 +33,7 @@ from sims.robot.integrator_settings import IntegratorSettings
 from sims.robot.robot_model import RobotModel
 
 EXPLICIT_INTEGRATORS = ("Euler", "RK4")
-"""Integrators that take the force of a servo from the begin of a step."""
+"""Integrators that take the force of a servo at the beginning of a step."""
 MIN_GROWTH = 1.01
 """Minimum growth of an error in one step at which a servo counts as unstable."""
 MAX_HALVINGS = 12
@@ -46,8 +46,8 @@ class UnstableServo(NamedTuple):
     Attributes:
         name: name of the actuator.
         growth: factor by which an error grows in a step, in the worst pose.
-        stable_step: largest stable step in seconds in this pose, of those that are the present one
-            divided by a power of two; None if none is stable.
+        stable_step: stable step in seconds in this pose, found by halving the present one; None if
+            none is stable.
     """
 
     name: str
@@ -121,7 +121,7 @@ def list_unstable_servos(
 
 
 def _find_stable_step(motion: ServoMotion, step: float, integrator: str) -> float | None:
-    """Return the largest stable step, in seconds, among those of `UnstableServo.stable_step`."""
+    """Return the first stable step in seconds, halving the present one; None if none is."""
     for halvings in range(1, MAX_HALVINGS + 1):
         smaller_step = step * 0.5**halvings
         if motion.compute_growth(smaller_step, integrator) < MIN_GROWTH:

@@ -42,17 +42,17 @@ class CellError(Exception):
         super().__init__(self.says)
 
 
-def make_table_error(path: Path, place: str, problem: str, remedy: str) -> InputError:
+def make_table_error(path: Path, place: str | None, problem: str, remedy: str) -> InputError:
     """Make the one-line error for a damaged table file.
 
     Args:
         path: The file.
-        place: Where it is damaged, in the words of its format, such as ``line 3``; empty for the
+        place: Where it is damaged, in the words of its format, such as ``line 3``; None for the
             whole file.
         problem: What is wrong.
         remedy: Advice for a damaged file.
     """
-    subject = f"{path}, {place}" if place else str(path)
+    subject = str(path) if place is None else f"{path}, {place}"
     return InputError(f"{subject}: {problem}; {remedy}")
 
 

@@ -62,12 +62,13 @@ class CsvTable:
             row: Row, or None for the file.
             problem: What is wrong.
         """
-        return self._make_line_error(None if row is None else self._get_line_number(row), problem)
+        if row is not None:
+            return self._make_line_error(self._get_line_number(row), problem)
+        return make_table_error(self._path, None, problem, self._remedy)
 
-    def _make_line_error(self, line: int | None, problem: str) -> InputError:
-        """Make the error for a line of the file, counted from 1, or for the whole file."""
-        place = "" if line is None else f"line {line}"
-        return make_table_error(self._path, place, problem, self._remedy)
+    def _make_line_error(self, line: int, problem: str) -> InputError:
+        """Make the error for a line of the file, counted from 1."""
+        return make_table_error(self._path, f"line {line}", problem, self._remedy)
 
     def _read_text(self) -> str:
         """Read the file as text, without the byte order mark that Excel writes at the beginning.

@@ -214,7 +214,7 @@ class RunsTable(NamedTuple):
             row: Row, or None for the file.
             problem: What is wrong.
         """
-        place = "" if row is None else f"row {self.first_row + row}"
+        place = None if row is None else f"row {self.first_row + row}"
         return make_table_error(self.path, place, problem, self.remedy)
 
     def read_runs(self, experiment: Experiment) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +20,7 @@ from bench.cli.shared_options import (
 
 if TYPE_CHECKING:
     from bench.diagnosis.conventions.convention_comparison import ConventionDifference
-    from bench.logs.quality.quality_finding import QualityFinding
+    from bench.logs.quality.quality_finding import Anomaly, QualityFinding
     from sims.core.simulator import Simulator
     from sims.recording.recording import Recording
 
@@ -95,16 +96,16 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
         options.recording, options.system, options.model, fix_base=options.fix_base
     )
     robot_lines = list(recording_summary.format_robot_summary(kind))
-    warnings_to_print = _list_warnings(recording, kind)
+    missing_poses = list(find_missing_base_poses(recording, kind))
+    warnings_to_print = _list_warnings(recording, kind, missing_poses)
     findings = list(check_log_quality(recording, kind))
     active_recording, inactive = _remove_inactive_drives(recording, kind)
     findings += inactive
     differences: list[ConventionDifference] = []
     settings_to_fix: list[str] = []
-    missing_poses = [anomaly.text for anomaly in find_missing_base_poses(recording, kind)]
     if missing_poses:
         if options.fix:
-            raise InputError(f"{options.recording}: {missing_poses[0]}")
+            raise InputError(f"{options.recording}: {missing_poses[0].text}")
         warnings_to_print.append(
             "the conventions of the log are not compared with those of the model file, because an "
             "initial pose is missing"
@@ -146,7 +147,9 @@ def _run_inspect(options: argparse.Namespace, print_line: PrintLine) -> CommandR
     return CommandResult(document, EXIT_PROBLEMS_FOUND if has_unidentifiable else EXIT_OK)
 
 
-def _list_warnings(recording: Recording, kind: type[Simulator]) -> list[str]:
+def _list_warnings(
+    recording: Recording, kind: type[Simulator], missing_poses: Sequence[Anomaly]
+) -> list[str]:
     """List what looks wrong in a recording.
 
     These are omissions of its logs, time stamps, missing initial poses, servos that are unstable at
@@ -155,16 +158,16 @@ def _list_warnings(recording: Recording, kind: type[Simulator]) -> list[str]:
     Args:
         recording: recorded runs, with their channels, inputs and constants.
         kind: simulator class.
+        missing_poses: initial poses that the log does not state.
     """
     from bench.logs.quality.clock_checks import find_anomalies
     from bench.logs.quality.log_quality import find_log_anomalies, format_log_warnings
-    from bench.logs.quality.pose_checks import find_missing_base_poses
     from bench.logs.quality.servo_checks import check_servo_stability
 
     oddities = [
         *find_log_anomalies(recording),
         *find_anomalies(recording, kind),
-        *find_missing_base_poses(recording, kind),
+        *missing_poses,
         *check_servo_stability(recording, kind),
     ]
     return [

@@ -210,8 +210,8 @@ class TrajectoryFitter:
     def predict_costs(self, starts: Sequence[FitStart]) -> list[float]:
         """Return the cost that the first step of each fit would reach if the model were linear.
 
-        This takes one simulation of the start and its derivatives. A fit from a start near the
-        optimum hardly reaches less than a small share of this cost.
+        This takes one simulation of the start and its derivatives. From a start near the optimum, a
+        fit ends close to this cost.
 
         Args:
             starts: starts of the fits; one or more.

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.diagnosis.fitting.base_fit import BaseFit
 from bench.diagnosis.fitting.fitted_models import MAX_ITERATIONS, select_likeliest
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
@@ -43,9 +42,9 @@ not show it, as a share of the residual.
 """
 MAX_SUBSET_EFFECTS = 3
 """Maximum number of effects of which all subsets are fitted with another time step."""
-HOPELESS_COST_RATIO = 3.0
-"""Minimum ratio of the cost that a linear model predicts with another step to the cost that this
-step needs at which it is not tried.
+MAX_PREDICTED_COST_RATIO = 3.0
+"""Maximum ratio of the cost that a linear model predicts with another step to the cost that has to
+be reached; above it no fit is made.
 """
 REFIT_ITERATIONS = 8
 """Maximum number of steps of the fit of more effects with another time step."""
@@ -100,6 +99,9 @@ class TimeStepChoice:
         self._refinements = refinements
         # The error of a step must be far below `residual_rms`, the residual that remains with the
         # last step tried. Finer steps leave a smaller one.
+        # The cost of a residual that closes the required share of the gap.
+        max_rms = 1.0 + (1.0 - MIN_CLOSED_SHARE) * file_excess
+        max_cost = model.fit.fit.cost * (max_rms / residual_rms) ** 2
         for refinement in copy(self._refinements):
             if not refinement.is_accurate_enough(residual_rms):
                 continue
@@ -107,10 +109,10 @@ class TimeStepChoice:
             if runs.fitting.filtered_runs is None:
                 # A model that diverges with the file's step may be filtered with a finer one.
                 filter_simulated_runs(runs)
-            # Even the exact step would be hopeless then, as its motion is nearly the same.
-            max_rms = 1.0 + (1.0 - MIN_CLOSED_SHARE) * file_excess
-            max_cost = model.fit.fit.cost * (max_rms / (1.0 + file_excess)) ** 2
-            if not _list_hopeful(runs, [model.fit.fit.make_start()], model.fit, max_cost):
+            fitter = TrajectoryFitter(runs.fitting, runs.noise, model.fit.fixed_parameters)
+            # If this step cannot reach the cost, an exact one cannot either, as their motions are
+            # nearly the same.
+            if not _select_starts(fitter, [model.fit.fit.make_start()], max_cost):
                 break
             finer = model.refit(runs)
             log_likelihood, residual_rms = finer.rate()
@@ -253,40 +255,39 @@ def _rate_best_subset(runs: SimulatedRuns, result: SearchResult) -> tuple[float,
                 theta[indices] = evaluator.get_nominal_theta()[indices]
             starts.append(FitStart(subset, theta, fit.initial_states))
     fitter = TrajectoryFitter(evaluator, runs.noise, base.fixed_parameters)
-    starts = _list_hopeful(runs, starts, base, fitter.compute_cost(fit))
+    # The readings are the same with both steps, so that the costs can be compared.
+    result_cost = fitter.compute_cost(fit)
+    starts = _select_starts(fitter, starts, result_cost)
     if not starts:
         return -np.inf, np.inf
     fits = fitter.fit_models(
         starts,
         MAX_ITERATIONS if has_few_effects else REFIT_ITERATIONS,
         is_racing=True,
-        # The readings are the same with both steps, so that the costs can be compared.
-        lowest_cost=fitter.compute_cost(fit),
+        lowest_cost=result_cost,
     )
     search = runs.create_search(base)
     best = select_likeliest(*(search.add_fit(subset_fit) for subset_fit in fits))
     return rate_model(search, best)
 
 
-def _list_hopeful(
-    runs: SimulatedRuns, starts: Sequence[FitStart], base: BaseFit, max_cost: float
+def _select_starts(
+    fitter: TrajectoryFitter, starts: Sequence[FitStart], max_cost: float
 ) -> list[FitStart]:
-    """Return the starts whose fits with another step may reach a cost, by their linear models.
+    """Return the starts from which fits with another step may reach a cost, by linear models.
 
-    The error of a step is known from one simulation, and what parameters and first states can
-    compensate of it from the derivatives. Most steps are so rejected without a fit.
+    One simulation shows the error of the step, and its derivatives how much of this error other
+    parameters and first states can compensate.
 
     Args:
-        runs: the runs with the other step.
+        fitter: fitter of the runs with the other step.
         starts: fitted models with the present step.
-        base: base fit, whose fixed parameters stay fixed.
         max_cost: cost that a model has to reach.
     """
-    fitter = TrajectoryFitter(runs.fitting, runs.noise, base.fixed_parameters)
     return [
         start
         for start, cost in zip(starts, fitter.predict_costs(starts), strict=True)
-        if not cost > HOPELESS_COST_RATIO * max_cost
+        if not cost > MAX_PREDICTED_COST_RATIO * max_cost
     ]
 
 

@@ -248,8 +248,8 @@ class ModelFilters:
     ) -> FitStart | None:
         """Return the likeliest model of soft dry friction at a joint; it is cached.
 
-        A search compares several filters, which is slow. Its result is stored by effect and sign,
-        also if it is None, and other searches of the same models reuse it (`take_over`).
+        A search compares several filters, which is slow. Its result, which may be None, is stored
+        by effect and sign, and other searches of the same models reuse it (`take_over`).
 
         Args:
             name: name of a friction effect at a joint.

@@ -8,6 +8,7 @@ library are computed when they are needed, in double precision from responses in
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,36 +78,27 @@ class ResponseProducts:
     """
 
     def __init__(
-        self,
-        responses: Sequence[NDArray[np.floating]],
-        innovations: Sequence[Array],
-        known: ResponseProducts | None = None,
+        self, responses: Sequence[NDArray[np.floating]], innovations: Sequence[Array]
     ) -> None:
         """Compute the products with the innovations, and the sums of squares of the columns.
 
-        Products of columns with each other are computed later, when they are needed. They do not
-        depend on the innovations.
+        Products of columns with each other are computed later, when they are needed.
 
         Args:
             responses: whitened responses W (N, K) of each run: K columns of N samples.
             innovations: whitened innovations e (N,) of each run.
-            known: products of the same responses with other innovations, if there are any; those of
-                columns with each other are shared.
         """
         self._responses, self._innovations = responses, innovations
+        count = responses[0].shape[1]
+        self.squares = np.zeros((len(responses), count))
+        self.crosses = np.zeros((len(responses), count))
         self.totals = np.array([float(e @ e) for e in innovations])
-        shape = len(responses), responses[0].shape[1]
-        self.crosses = np.zeros(shape)
-        self.squares: Array = np.zeros(shape) if known is None else known.squares
         for run, samples, block in self._iterate_blocks():
+            self.squares[run] += np.einsum("sk,sk->k", block, block)
             self.crosses[run] += innovations[run][samples] @ block
-            if known is None:
-                self.squares[run] += np.einsum("sk,sk->k", block, block)
         # Products (K,) of a column with all others, and products within groups by their columns.
-        self._known_rows: dict[int, Array] = {} if known is None else known._known_rows
-        self._known_groups: dict[tuple[int, bytes], Array] = (
-            {} if known is None else known._known_groups
-        )
+        self._known_rows: dict[int, Array] = {}
+        self._known_groups: dict[tuple[int, bytes], Array] = {}
 
     def _iterate_blocks(self) -> Iterator[tuple[int, slice, Array]]:
         """Iterate over the run, the samples and the responses (s, K) of all blocks of samples."""
@@ -179,8 +171,14 @@ class ResponseProducts:
         Args:
             column: index of the column w; the new innovations are e + w.
         """
-        innovations = [
+        # Products of columns with columns do not depend on the innovations, and are shared.
+        result = copy(self)
+        result._innovations = [
             e + responses[:, column]
             for responses, e in zip(self._responses, self._innovations, strict=True)
         ]
-        return ResponseProducts(self._responses, innovations, known=self)
+        result.totals = np.array([float(e @ e) for e in result._innovations])
+        result.crosses = np.zeros_like(self.crosses)
+        for run, samples, block in self._iterate_blocks():
+            result.crosses[run] += result._innovations[run][samples] @ block
+        return result

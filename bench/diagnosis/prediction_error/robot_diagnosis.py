@@ -28,11 +28,7 @@ from bench.diagnosis.search.alternative_causes import (
 from bench.diagnosis.search.diagnose import Diagnosis, DiagnosisResult, compute_gap_closed
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.held_out_model_choice import HeldOutValidation
-from bench.diagnosis.search.lack_of_fit import (
-    LackOfFitResult,
-    assess_lack_of_fit,
-    assess_residual_size,
-)
+from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit, assess_residual_size
 from bench.diagnosis.search.verdict_rules import (
     INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO,
     DiagnosisState,
@@ -146,8 +142,12 @@ class RobotDiagnosis(Diagnosis):
             cause_count=len(causes),
             has_alternatives=any(cause.alternatives for cause in causes),
             gap_closed=compute_gap_closed(search, model, lack_of_fit),
+            # The test of missing effects takes seconds, and does not matter if there is structure.
             is_unexplained=not search.leaves_only_creep_of_contacts(model)
-            and self._is_unexplained(model, lack_of_fit),
+            and (
+                lack_of_fit.has_structure
+                or is_unexplained(False, search.compute_p_value_of_missing_effect(model))
+            ),
             misses_held_out_gap=validation is not None
             and validation.has_unexplained_gap(model, lack_of_fit),
         )
@@ -156,21 +156,6 @@ class RobotDiagnosis(Diagnosis):
             # Effects that leave most of the discrepancy only mimic what is missing.
             model, causes = base, ()
         return self._make_result(verdict, base, model, causes, lack_of_fit)
-
-    def _is_unexplained(self, model: FittedModel, lack_of_fit: LackOfFitResult) -> bool:
-        """Return whether the model lacks something: structure in the residual, or an effect.
-
-        Args:
-            model: the fitted model with the causes.
-            lack_of_fit: result of its lack-of-fit test.
-        """
-        # The test of missing effects takes seconds, and does not matter if there is structure.
-        p_value = (
-            1.0
-            if lack_of_fit.has_structure
-            else self._robot_search.compute_p_value_of_missing_effect(model)
-        )
-        return is_unexplained(lack_of_fit.has_structure, p_value)
 
     def _refit_near_competitors(self, gain: float) -> None:
         """Fit the nearest competing models to final convergence, as the model was.

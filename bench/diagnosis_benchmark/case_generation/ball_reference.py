@@ -209,7 +209,7 @@ def simulate_ball(
             resting,
         )
         time_reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
-        # The samples after the begin of this part, up to its end.
+        # The samples after the beginning of this part, up to its end.
         first, last = np.searchsorted(instants, [time, time_reached], side="right")
         if last > first:
             states[first:last] = solved.sol(instants[first:last]).T

@@ -439,7 +439,7 @@ def _draw_position_friction(
 def _draw_warm_up_friction(
     coefficient_scale: float, motion: BaseMotion, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw warm-up friction, partly viscous, which is largest at the begin of a run.
+    """Draw warm-up friction, partly viscous, which is largest at the beginning of a run.
 
     It decays exponentially, with a time constant of 0.2 to 0.8 run lengths but at least 0.5 s.
 

@@ -547,7 +547,7 @@ def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, stat
 
     Args:
         joint: the equation of motion, with its input interval.
-        state: position, velocity and hidden states at the begin of the interval.
+        state: position, velocity and hidden states at the beginning of the interval.
         instants: times of the samples, (T,).
         states: receives positions and velocities at the samples within the interval, (T, 2).
 

@@ -126,7 +126,7 @@ class _MachineIntegrator:
         Shapes: L runs, N joints.
 
         Args:
-            t: time at the begin of the step, s.
+            t: time at the beginning of the step, s.
             h: length of the step, s.
             u: mean applied input over the step, (L, N).
         """
@@ -223,10 +223,10 @@ class _MachineIntegrator:
         Shapes: L runs, N joints.
 
         Args:
-            t: time at the begin of the step, s.
+            t: time at the beginning of the step, s.
             h: length of the step, s.
             u: applied input, (L, N).
-            velocity_before: velocities at the begin of the step, (L, N).
+            velocity_before: velocities at the beginning of the step, (L, N).
         """
         # The velocity has changed its sign against the direction of friction.
         has_stopped = (self.sliding_direction * self.v < 0.0) & (

@@ -59,7 +59,7 @@ MAX_DEVIATION = 1e3
 CANDIDATES_PER_BLOCK = 64
 """Number of candidates whose responses are computed together."""
 MAX_JACOBIAN_SECONDS = 0.02
-"""Maximum time, in seconds, for which a Jacobian is reused."""
+"""Maximum time in seconds for which a Jacobian is held, if no longer time is given."""
 STATE_DIFFERENCE = 1e-4
 """Size of the state difference for finite-difference derivatives of readings."""
 
@@ -122,8 +122,8 @@ class MeasuredLinear(RunLinearisation):
         """Linearise about the given motion, and compute its readings and the step of each sample.
 
         The derivatives of a step (Jacobians) are computed by differences, and held for one sample
-        interval, but not for more than `MAX_JACOBIAN_SECONDS` or less than a given time. With
-        `nearby`, a model of a similar motion, most of this work is saved.
+        interval up to `MAX_JACOBIAN_SECONDS`, or for a given time if that is longer. With `nearby`,
+        a model of a similar motion, most of this work is saved.
 
         Args:
             simulator: simulator of the robot.
@@ -518,19 +518,10 @@ class MeasuredLinear(RunLinearisation):
         Returns:
             (T - 1, E + nu, K) means; zero for an interval without a step.
         """
-        lengths = np.diff(self.knots)  # number of steps in each interval
-        # Mostly, all intervals have the same number of steps, for which there is a faster way.
-        if lengths.size and (lengths == lengths[0]).all() and lengths[0]:
-            steps = slice(self.knots[0], self.knots[-1])
-            by_interval = inputs[steps].reshape(lengths.size, lengths[0], *inputs.shape[1:])
-            uniform_means: Array = by_interval.sum(axis=1) / lengths[0]
-            return uniform_means
-        non_empty = np.flatnonzero(lengths)
-        means = np.zeros((lengths.size, *inputs.shape[1:]))
-        # Sums from the first step of each interval to that of the next one. `reduceat` cannot make
-        # an empty sum, so intervals without a step are left out.
-        sums = np.add.reduceat(inputs[: self.knots[-1]], self.knots[:-1][non_empty], axis=0)
-        means[non_empty] = sums / lengths[non_empty][:, None, None]
+        sums = np.zeros((self.knots.size - 1, *inputs.shape[1:]))
+        for steps, intervals in self._list_active_intervals():
+            sums[intervals] += inputs[steps]
+        means: Array = sums / np.maximum(np.diff(self.knots), 1)[:, None, None]
         return means
 
     @cached_property

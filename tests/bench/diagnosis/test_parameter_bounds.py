@@ -199,17 +199,17 @@ def test_the_bound_is_said_wherever_the_number_is(bounded):
 def test_a_partial_verdict_for_a_bound_says_which():
     number = {"value": 4.0, "unit": "s", "low": None, "high": None, "at_bound": "high"}
     lag = {**DRAG, "effect": "sensor.lag", "coefficients": {"coefficient": number}}
-    told = make_report("partial", causes=[lag])
-    assert format_headline(told) == (
+    report = make_report("partial", causes=[lag])
+    assert format_headline(report) == (
         "The simulation lacks a sensor lag, but the fit ends at the upper bound of its range, 4 s."
     )
-    said = " ".join(" ".join(format_summary(told)).split())
+    said = " ".join(" ".join(format_summary(report)).split())
     assert "sensor.lag, coefficient: 4 s is the upper bound of its range" in said
     assert "record longer runs" in said
     assert "coefficient 4 s (upper bound of its range)" in said
 
 
-def get_parameter_text(*changes):
+def format_parameter_text(*changes):
     """Return the paragraph on the parameters in the summary of one cause."""
     report = replace(make_report("named", causes=[DRAG]), parameters=list(changes))
     paragraphs = "\n".join(format_summary(report)).split("\n\n")
@@ -219,7 +219,7 @@ def get_parameter_text(*changes):
 
 def test_a_parameter_at_its_bound_is_said_to_be_there():
     p = ParameterChange("mass", "kg", (1.0, 0.9, 1.1), (10.0, np.nan, np.nan), True, (None, "high"))
-    assert "10 kg (upper bound of its range) after" in get_parameter_text(p)
+    assert "10 kg (upper bound of its range) after" in format_parameter_text(p)
 
 
 def test_many_parameters_are_listed_without_intervals():
@@ -231,8 +231,8 @@ def test_many_parameters_are_listed_without_intervals():
     mass = ParameterChange(
         "mass", "kg", (1.0, 0.9, 1.1), (9.0, np.nan, np.nan), True, (None, "high")
     )
-    assert get_parameter_text(stiff, still, mass).count("before") == 3
-    four = get_parameter_text(stiff, still, still, mass)
+    assert format_parameter_text(stiff, still, mass).count("before") == 3
+    four = format_parameter_text(stiff, still, still, mass)
     assert four == (
         "2 of 4 had absorbed part of the gap (before → after): kp −0.3 → 0.05, in the model file "
         "20 → 21 N·m/rad; kv 0.1 → 0.1; kv 0.1 → 0.1; mass 1 → 9 kg (upper bound of its range)."
@@ -270,7 +270,7 @@ def test_nothing_of_a_number_at_a_bound_is_written_into_a_model_file():
 )
 def test_a_parameter_absorbs_what_is_significant(before, after, absorbed):
     p = ParameterChange("inertia", "kg*m^2", before, after, True)
-    said = get_parameter_text(p)
+    said = format_parameter_text(p)
     assert has_absorbed_gap(p) is absorbed
     assert ("absorbed part of the gap" in said) is absorbed
     assert "(0.0 %)" not in said

@@ -50,7 +50,8 @@ def write_recording(folder: Path, seed: int = 0) -> Path:
     return write_log(folder, description, columns, runs, robot=ROVER)
 
 
-def score(folder, seed=0):
+def compute_scores(folder, seed=0):
+    """Record a rover with one large wheel, and score the effects of its model."""
     path = write_recording(folder, seed)
     runs = prepare_runs([path], DiagnosisContext(ExplainOptions(), ForkedWorkerPool(1)))
     search = runs.create_search(filter_and_fit(runs).fit, runs.make_rng())
@@ -59,7 +60,7 @@ def score(folder, seed=0):
 
 @pytest.fixture(scope="module")
 def scores(tmp_path_factory):
-    return score(tmp_path_factory.mktemp("rover"))
+    return compute_scores(tmp_path_factory.mktemp("rover"))
 
 
 def test_the_response_to_a_radius_is_that_of_rolling(scores):
@@ -95,7 +96,7 @@ def test_a_planted_radius_explains_most_of_the_residual(tmp_path):
     for seed in range(4):
         folder = tmp_path / str(seed)
         folder.mkdir()
-        scores = score(folder, seed)
+        scores = compute_scores(folder, seed)
         start = scores.simulations.refine(scores.list_starts()[0])
         assert start.effects == ("geom.radius@left_tyre",)
         (index,) = scores.context.evaluator.get_coefficient_indices("geom.radius@left_tyre")

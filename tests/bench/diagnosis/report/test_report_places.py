@@ -154,8 +154,8 @@ def test_a_further_effect_is_missing_although_a_number_is_wrong():
     )
     assert text.endswith("and the simulation lacks something else that no known cause explains.")
     both = format_headline(make_robot_report("partial", [COULOMB, HEAVY]))
-    told = " ".join(format_gain_and_caveats(make_robot_report("partial", [COULOMB, HEAVY])))
-    assert "opposes motion; the mass of body elbow_link is 12 % larger than" in told
+    report = " ".join(format_gain_and_caveats(make_robot_report("partial", [COULOMB, HEAVY])))
+    assert "opposes motion; the mass of body elbow_link is 12 % larger than" in report
     assert both.endswith("elbow_link, and lacks something else that no known cause explains.")
 
 
@@ -172,19 +172,19 @@ OTHER = cause(
 
 
 def test_a_wrong_step_of_a_robot_is_reported_with_its_correction():
-    told = make_robot_report(causes=[SHORTER])
-    assert format_headline(told) == (
+    report = make_robot_report(causes=[SHORTER])
+    assert format_headline(report) == (
         "The time step of the model file is too long: a time step of 0.0005 s follows the "
         "robot's motion."
     )
-    text = " ".join(format_summary(told))
+    text = " ".join(format_summary(report))
     assert "Too long a time step (numerics.step): time step 5×10⁻⁴ s; p" in text
     both = make_robot_report(causes=[OTHER, COULOMB])
     assert format_headline(both) == (
         "The simulation lacks Coulomb friction at joint elbow, and has an unsuitable integrator."
     )
     assert "(numerics.integrator): p = 1×10⁻⁹." in " ".join(format_summary(both))
-    assert not list_place_marks(told)
+    assert not list_place_marks(report)
 
 
 def test_another_integrator_is_not_called_inaccurate():
@@ -214,10 +214,12 @@ def test_what_is_wrong_and_what_is_lacking():
 
 
 def test_causes_without_places_are_listed_as_ever():
-    told = make_report("ambiguous").verdict.causes
-    assert format_missing_causes(told) == "lacks linear drag or Coulomb friction"
-    sure = replace(told[0], effect="wind", alternatives=())
-    assert format_missing_causes([sure, *told]) == "lacks wind, and linear drag or Coulomb friction"
+    report = make_report("ambiguous").verdict.causes
+    assert format_missing_causes(report) == "lacks linear drag or Coulomb friction"
+    sure = replace(report[0], effect="wind", alternatives=())
+    assert (
+        format_missing_causes([sure, *report]) == "lacks wind, and linear drag or Coulomb friction"
+    )
 
 
 def test_the_account_says_numbers_at_their_places():
@@ -238,10 +240,10 @@ def test_what_an_effect_does_is_said_without_its_place():
 
 
 def test_of_many_channels_the_worst_of_each_kind_is_said():
-    told = make_robot_report("adequate", causes=())
-    assert " ".join(format_gain_and_caveats(told)).count(" of its noise") == 2
+    report = make_robot_report("adequate", causes=())
+    assert " ".join(format_gain_and_caveats(report)).count(" of its noise") == 2
     few = replace(
-        told,
+        report,
         channels=(
             *make_report().channels,
             *(ChannelInfo(f"x{i}", "m", 1.0, True, 0.0) for i in range(10)),
@@ -278,8 +280,8 @@ def test_a_family_marks_each_of_its_places():
 
 
 def test_candidates_of_one_effect_are_one_entry_where_it_explains_most():
-    told = make_robot_report()
-    there = rank_candidates(told)
+    report = make_robot_report()
+    there = rank_candidates(report)
     effects = [entry.best.effect for entry in there]
     assert effects[0] == "friction.coulomb@elbow"
     assert len({effect.partition("@")[0] for effect in effects}) == len(effects)
@@ -288,13 +290,13 @@ def test_candidates_of_one_effect_are_one_entry_where_it_explains_most():
     scores = [c.score for c in there[0].elsewhere]
     assert scores == sorted(scores, reverse=True)
     total = sum(1 + len(entry.elsewhere) for entry in there)
-    assert total == len(told.verdict.candidates) > 80
+    assert total == len(report.verdict.candidates) > 80
 
 
 def test_a_family_stands_for_its_effect_only_where_it_explains_much_more():
-    told = make_robot_report(causes=())
+    report = make_robot_report(causes=())
     scores = {"drag.linear@*": 100.0, "drag.linear@elbow": 95.0, "gravity.tilt": 1.0}
-    rows = [{**told.verdict.candidates[0].to_document(), "effect": n, "score": s}
+    rows = [{**report.verdict.candidates[0].to_document(), "effect": n, "score": s}
             for n, s in scores.items()]  # fmt: skip
     heads = [
         entry.best.effect
@@ -317,6 +319,6 @@ def test_every_cause_stands_for_itself_among_the_candidates():
 
 
 def test_without_places_each_candidate_is_an_entry():
-    told = make_report()
-    assert [entry.best for entry in rank_candidates(told)] == list(told.verdict.candidates)
-    assert isinstance(told.verdict.causes[0], Cause)
+    report = make_report()
+    assert [entry.best for entry in rank_candidates(report)] == list(report.verdict.candidates)
+    assert isinstance(report.verdict.causes[0], Cause)

@@ -40,7 +40,7 @@ def text(report):
     return " ".join(" ".join(format_summary(report)).split())
 
 
-def get_gain_text(report):
+def format_gain_text(report):
     """Return the sentences after the headline, of which the first one is the gain."""
     return " ".join(format_gain_and_caveats(report))
 
@@ -69,9 +69,9 @@ def get_gain_text(report):
     ],
 )
 def test_each_verdict_has_its_headline(verdict, headline):
-    told = make_report(verdict)
-    assert format_headline(told) == headline
-    assert headline in text(told)
+    report = make_report(verdict)
+    assert format_headline(report) == headline
+    assert headline in text(report)
 
 
 def test_only_found_causes_are_said_to_be_lacking():
@@ -80,19 +80,19 @@ def test_only_found_causes_are_said_to_be_lacking():
 
 
 def test_several_causes_are_named_together():
-    told = make_report(causes=[DRAG, TILT])
-    assert format_headline(told) == "The simulation lacks linear drag and a tilt of gravity."
-    assert "Together they close 90 % of the gap" in get_gain_text(told)
-    assert "gravity has a horizontal component" in text(told)
+    report = make_report(causes=[DRAG, TILT])
+    assert format_headline(report) == "The simulation lacks linear drag and a tilt of gravity."
+    assert "Together they close 90 % of the gap" in format_gain_text(report)
+    assert "gravity has a horizontal component" in text(report)
 
 
 def test_an_ambiguous_cause_with_a_certain_one():
-    told = make_report("ambiguous", causes=[EITHER, TILT])
+    report = make_report("ambiguous", causes=[EITHER, TILT])
     expected = (
         "The simulation lacks a tilt of gravity, and linear drag or Coulomb friction: "
         "these data do not show which."
     )
-    assert format_headline(told) == expected
+    assert format_headline(report) == expected
 
 
 def test_a_partial_verdict_keeps_what_cannot_be_distinguished():
@@ -102,7 +102,7 @@ def test_a_partial_verdict_keeps_what_cannot_be_distinguished():
 
 
 def test_the_gain_of_a_partial_verdict_is_that_of_the_named_cause():
-    assert get_gain_text(make_report("partial")).startswith("Linear drag closes 90 % of the gap")
+    assert format_gain_text(make_report("partial")).startswith("Linear drag closes 90 % of the gap")
 
 
 def test_unidentifiable_names_the_unidentified_parameters():
@@ -112,33 +112,33 @@ def test_unidentifiable_names_the_unidentified_parameters():
 
 
 def test_the_gain_is_reported_with_its_interval_and_units():
-    said = get_gain_text(make_report())
+    said = format_gain_text(make_report())
     assert "closes 90 % of the gap (85 to 94 %)" in said
     assert "0.37 rad before and 0.045 rad after" in said
     assert said.endswith("the sensor noise alone would give 0.01 rad.")
 
 
 def test_without_held_out_runs_the_gain_is_not_claimed():
-    told = make_report(heldout=None, held_out=None)
-    side = told.fitting
+    report = make_report(heldout=None, held_out=None)
+    side = report.fitting
     before = np.sqrt(np.nanmean(((side.observed - side.before) / [0.01, 0.05]) ** 2))
-    assert "No run is held out" in get_gain_text(told)
-    assert f"{before:.3g} times the noise before" in get_gain_text(told)
-    assert "of the gap" not in get_gain_text(told)
+    assert "No run is held out" in format_gain_text(report)
+    assert f"{before:.3g} times the noise before" in format_gain_text(report)
+    assert "of the gap" not in format_gain_text(report)
 
 
 def test_nothing_is_called_closed_where_no_share_is_known():
     found = {**HELD_OUT, "gap_closed": None, "low": None, "high": None}
-    assert "of the gap" not in get_gain_text(make_report(heldout=found))
-    assert "0.045 rad after" in get_gain_text(make_report(heldout=found))
+    assert "of the gap" not in format_gain_text(make_report(heldout=found))
+    assert "0.045 rad after" in format_gain_text(make_report(heldout=found))
 
 
 def test_a_weak_cause_under_unknown_is_not_sold_as_the_answer():
-    told = make_report(
+    report = make_report(
         "unknown", causes=[DRAG], heldout={**HELD_OUT, "gap_closed": 0.3, "low": 0.1, "high": 0.5}
     )
-    assert format_headline(told).startswith("Something is missing")
-    assert get_gain_text(told).startswith(
+    assert format_headline(report).startswith("Something is missing")
+    assert format_gain_text(report).startswith(
         "The best of them, linear drag, closes only 30 % of the gap (10 to 50 %)"
     )
 
@@ -317,19 +317,21 @@ CUT = {"by": "budget", "during": "refit of drag.linear and 3 more", "not_asked":
 
 
 def test_an_early_end_is_reported_before_anything_else():
-    told = text(make_report("unknown", cut=CUT, causes=[DRAG]))
-    assert "The search stopped before it identified what the simulation lacks; best" in told
-    assert "by its time budget; last step: refit of drag.linear and 3 more. Not" in told
-    assert "none of the 6 known causes" not in told, "they were not all asked"
-    told = text(make_report("unknown", cut={**CUT, "by": "interrupt"}))
-    assert "before it identified what the simulation lacks. The search was stopped by an in" in told
-    told = text(make_report("partial", cut={**CUT, "not_asked": ["structure"]}))
-    assert "lacks linear drag; the search stopped before testing for further causes." in told
-    assert "something else that no known cause explains" not in told
+    report = text(make_report("unknown", cut=CUT, causes=[DRAG]))
+    assert "The search stopped before it identified what the simulation lacks; best" in report
+    assert "by its time budget; last step: refit of drag.linear and 3 more. Not" in report
+    assert "none of the 6 known causes" not in report, "they were not all asked"
+    report = text(make_report("unknown", cut={**CUT, "by": "interrupt"}))
+    assert (
+        "before it identified what the simulation lacks. The search was stopped by an in" in report
+    )
+    report = text(make_report("partial", cut={**CUT, "not_asked": ["structure"]}))
+    assert "lacks linear drag; the search stopped before testing for further causes." in report
+    assert "something else that no known cause explains" not in report
 
 
 def test_held_out_runs_that_were_not_asked_are_not_said_to_be_missing():
     cut = {**CUT, "not_asked": ["held_out", "structure"]}
-    told = text(make_report("unknown", cut=cut, heldout=None))
-    assert "The gain was not measured on held-out runs" in told
-    assert "No run is held out" not in told
+    report = text(make_report("unknown", cut=cut, heldout=None))
+    assert "The gain was not measured on held-out runs" in report
+    assert "No run is held out" not in report
