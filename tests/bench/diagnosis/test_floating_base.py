@@ -7,6 +7,11 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
+from bench.diagnosis.conventions.convention_comparison import (
+    ConventionComparison,
+    ConventionDifference,
+)
+from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis
 from bench.diagnosis.explain import explain
 from bench.logs.quality.log_quality import check_recording_plausible
 from bench.logs.recording_loading import load_recording
@@ -143,11 +148,10 @@ def test_where_it_begins_is_asked_for_in_one_line(name, tmp_path):
     assert "\n" not in str(raised.value)
 
 
-def test_conventions_are_compared_once_a_pose_is_stated(tmp_path):
-    """The axis of the boom is reversed in the log."""
-    reversed_axis = TOML.replace("noise = 0.001", "noise = 0.001\nscale = -1.0")
-    reversed_axis = reversed_axis.replace('unit = "N*m"', 'unit = "N*m"\nscale = -1.0')
-    path = recorded(tmp_path, reversed_axis)
+def test_conventions_are_compared_once_a_pose_is_stated(tmp_path, monkeypatch):
+    difference = ConventionDifference(ConventionHypothesis("the boom looks reversed"), 30.0)
+    monkeypatch.setattr(ConventionComparison, "differences", lambda _: [difference])
+    path = recorded(tmp_path, TOML)
     output = run_command("inspect", path, "--out", tmp_path / "out").out
     assert "run 1: the log does not state where base begins" in output
     assert "conventions of the log are not compared" in output
@@ -155,9 +159,10 @@ def test_conventions_are_compared_once_a_pose_is_stated(tmp_path):
     error = run_command("inspect", path, "--fix", tmp_path / "fixed.toml", code=2).err
     assert "state [runs.1.initial]" in error
     assert not (tmp_path / "fixed.toml").exists()
-    path.with_suffix(".toml").write_text(reversed_axis + STATED)
+    path.with_suffix(".toml").write_text(TOML + STATED)
     output = run_command("inspect", path, "--out", tmp_path / "out").out
     assert "conventions of the log are not compared" not in output
+    assert "convention: the boom looks reversed" in output
 
 
 def test_a_simulated_log_says_where_its_runs_began(tmp_path):
