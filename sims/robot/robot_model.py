@@ -433,6 +433,18 @@ class RobotModel:
         """
         return self._find_by_name("joint", name, {joint.name: joint for joint in self.joints})
 
+    def compute_servo_damping(self, actuator: Actuator) -> float:
+        """Return the damping of its joint by a position servo, in N s/m or N m s/rad.
+
+        Args:
+            actuator: position servo of this robot.
+        """
+        model = self.compiled
+        # The third bias parameter of MuJoCo's servo is minus its damping.
+        return float(
+            model.actuator_gear[actuator.id, 0] ** 2 * -model.actuator_biasprm[actuator.id, 2]
+        )
+
     def actuator(self, name: str) -> Actuator:
         """Return the actuator with a name; errors as in `joint`."""
         return self._find_by_name("actuator", name, {a.name: a for a in self.actuators})

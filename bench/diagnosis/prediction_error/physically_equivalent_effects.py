@@ -211,10 +211,7 @@ def get_servo_damping(evaluator: RunEvaluator, joint: int) -> tuple[str, float] 
     name = f"actuator.damping@{servo}"
     if not isinstance(simulator, RobotSimulator) or name not in evaluator.library:
         return None
-    # The third bias parameter of MuJoCo's servo is minus its damping.
-    actuator, model = simulator.robot.actuator(servo).id, simulator.robot.compiled
-    gear, servo_damping = model.actuator_gear[actuator, 0], -model.actuator_biasprm[actuator, 2]
-    damping = float(gear**2 * servo_damping)
+    damping = simulator.robot.compute_servo_damping(simulator.robot.actuator(servo))
     return (name, damping) if damping > 0.0 else None
 
 

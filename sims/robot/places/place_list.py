@@ -74,6 +74,8 @@ class EffectPlace(NamedTuple):
             motion.
         pairs: for a contact, the pairs of geoms whose contacts get parameters of their own.
         is_base: whether it is a coordinate of a floating body whose pose is recorded.
+        servo_damping: for a joint, the damping by its servos in N s/m or N m s/rad, which acts like
+            that of the joint.
     """
 
     name: str
@@ -93,6 +95,7 @@ class EffectPlace(NamedTuple):
     tilts: tuple[str, ...] = ()
     pairs: tuple[str, ...] = ()
     is_base: bool = False
+    servo_damping: float = 0.0
 
 
 def list_places(
@@ -159,6 +162,11 @@ def _list_joint_places(robot: RobotModel) -> list[EffectPlace]:
             coupled=joint.name in may_be_coupled,
             tilts=tuple("xyz"[axis] for axis in observable_tilts(robot, joint.name)),
             is_base=joint.name in robot.base_joints,
+            servo_damping=sum(
+                robot.compute_servo_damping(actuator)
+                for actuator in robot.actuators
+                if actuator.joint == joint.name and actuator.kind == "position"
+            ),
         )
         for coordinate, joint in enumerate(j for j in robot.joints if j.has_one_coordinate)
     ]

@@ -490,6 +490,9 @@ def _adapt_to_place(effect: type[Effect], c: Coefficient, effect_place: EffectPl
     if effect.name == "inertia.armature":
         # A gear multiplies the inertia of a rotor, which may exceed that of the links.
         high = 3.0 * effect_place.inertia
+    if effect.name == "drag.linear":
+        # A joint may have as much damping as its servo, which acts alike.
+        high = max(high, effect_place.servo_damping)
     if c.of == "give":
         # A compliance, at most that with which the load swings at the lowest frequency.
         high = 1.0 / (effect_place.inertia * MIN_LOAD_FREQUENCY**2)

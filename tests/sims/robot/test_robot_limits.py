@@ -159,6 +159,17 @@ def test_a_link_without_inertia_does_not_shrink_the_ranges_of_its_joint(yaw, tmp
     assert free.bounds[1] > 4e-4
 
 
+def test_a_light_joint_may_have_as_much_damping_as_its_servo(tmp_path):
+    # The weight of the last link moves the joint with 5e-9 N·m/rad; the servo damps it with
+    # gear**2 * kv.
+    servo = '<actuator><position name="s" joint="roll" kp="2000" kv="50" gear="2"/></actuator>'
+    driven = robot(tmp_path, YAW.replace("</worldbody>", f"</worldbody>{servo}"))
+    effect = make_robot_simulator(driven).system.effect("drag.linear@roll")
+    assert effect.coefficients[0].plausible[0] == (0.0, pytest.approx(4 * 50.0))
+    undriven = make_robot_simulator(robot(tmp_path, YAW)).system.effect("drag.linear@roll")
+    assert undriven.coefficients[0].plausible[0][1] < 0.1
+
+
 def test_bounds_far_apart_are_not_met_by_numbers_near_zero():
     assert bound_of(-0.00099, -0.001, MAX_RANGE_FACTOR_MODEL_FILE) is None
     assert bound_of(-0.001, -0.001, MAX_RANGE_FACTOR_MODEL_FILE) == "low"
