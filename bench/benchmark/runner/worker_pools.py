@@ -504,13 +504,15 @@ class _WorkerSlot:
         """
         ended_calls: list[tuple[_AssignedCall, Any]] = []
         is_lost = False
+        # A worker begins its calls in the order of assignment.
+        oldest_call = next(iter(self.assigned_calls.values()), None)
         for future in [future for future in self.assigned_calls if future.done()]:
             call, error = self.assigned_calls.pop(future), future.exception()
             is_lost = is_lost or _loses_the_worker(error)
             # A result shows that this worker works.
             if error is None:
                 self._failed_restarts = 0
-            if _should_retry(call, error):
+            if _should_retry(call, error, call is oldest_call):
                 waiting.appendleft(call)
             else:
                 ended_calls.append(
@@ -571,7 +573,7 @@ def _loses_the_worker(error: BaseException | None) -> bool:
     )
 
 
-def _should_retry(call: _AssignedCall, error: BaseException | None) -> bool:
+def _should_retry(call: _AssignedCall, error: BaseException | None, may_have_begun: bool) -> bool:
     """Return whether to repeat a call whose worker was killed or lost, and count the deaths.
 
     A pool that broke has not begun the call, or has not reported its result. A worker that was
@@ -581,14 +583,15 @@ def _should_retry(call: _AssignedCall, error: BaseException | None) -> bool:
     Args:
         call: the call, whose number of deaths is increased in place.
         error: error with which it ended; None if it has a result.
+        may_have_begun: whether the worker may have begun the call when the pool broke.
     """
     # None unless the worker died during the call.
     code = _get_exit_code(error)
     is_repeated = isinstance(error, BrokenExecutor) or (
         code in _EXTERNAL_KILL_EXIT_CODES and call.deaths < MAX_RETRIES
     )
-    # A pool that broke has no exit code, and does not count as a death.
-    if is_repeated and code is not None:
+    # A pool that broke has no exit code.
+    if is_repeated and (code is not None or may_have_begun):
         call.deaths += 1
     return is_repeated
 
