@@ -278,19 +278,30 @@ def find_recorded_contacts(recording: Recording, kind: type[Simulator]) -> tuple
             is_touching = data.contact.dist[: data.ncon] <= 0.0
             touching_geoms = data.contact.geom[: data.ncon][is_touching]
             counts.update({(int(min(pair)), int(max(pair))) for pair in touching_geoms})
-    # Kinematic trees (bodies connected by joints) in which some joint is recorded. The index of a
-    # joint's velocity is that of its degree of freedom.
-    recorded_trees = {
-        int(model.dof_treeid[joint.velocity])
-        for run in recording.training()
-        for joint in kind.robot.joints  # type: ignore[attr-defined]
-        if f"q.{joint.name}" in run.channels
-    }
-    acting_pairs = _select_acting_pairs(model, counts, recorded_trees)
+    acting_pairs = _select_acting_pairs(model, counts, list_recorded_trees(recording, kind))
     frequent_pairs = Counter({pair: counts[pair] for pair in acting_pairs}).most_common(
         MAX_CONTACTS
     )
     return tuple(sorted({make_pair_name(model, pair) for pair, _ in frequent_pairs}))
+
+
+def list_recorded_trees(recording: Recording, kind: type[Simulator]) -> set[int]:
+    """Return the kinematic trees (`MjModel.body_treeid`) in which some joint is recorded.
+
+    A kinematic tree consists of bodies that joints connect. Held-out runs are not used.
+
+    Args:
+        recording: recording of the robot.
+        kind: simulator class of the robot.
+    """
+    robot = kind.robot  # type: ignore[attr-defined]
+    # The index of a joint's velocity is that of its degree of freedom.
+    return {
+        int(robot.compiled.dof_treeid[joint.velocity])
+        for run in recording.training()
+        for joint in robot.joints
+        if f"q.{joint.name}" in run.channels
+    }
 
 
 def can_touch(model: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Check the recorded poses of a robot: overlaps, and missing initial poses of floating bodies.
+"""Check the recorded poses of a robot: bodies that touch, and missing poses of floating bodies.
 
 Initial poses are not estimated, and the same commands produce a different motion from a different
 initial pose.
@@ -6,6 +6,7 @@ initial pose.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,14 +19,24 @@ MIN_OVERLAP_METRES = 1e-3
 """Smallest depth, in m, at which two bodies overlap; feet on the ground sink in by less."""
 MIN_OVERLAP_SHARE = 0.9
 """Smallest share of the recorded poses in which bodies overlap that do so by their shape."""
+MIN_TOUCHING_SHARE = 0.05
+"""Smallest share of the recorded poses in which links touch each other that is reported."""
+MAX_TOUCHING_PAIRS = 3
+"""Maximum number of pairs of links that are reported for touching each other."""
 
 
 def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
-    """Find bodies of a robot that overlap in most of the recorded poses.
+    """Find bodies of a robot that overlap in most of the recorded poses, or touch in some.
 
-    Contact forces would then act all the time, which is not possible in a real robot: the shapes
-    in the model file are too large. A pair counts at most once in a pose, with its deepest contact,
-    and only if that is deeper than `MIN_OVERLAP_METRES`. Held-out runs are not used.
+    * Contact forces between bodies that always overlap would act all the time, which is not
+      possible in a real robot: the shapes in the model file are too large. A pair counts at most
+      once in a pose, with its deepest contact, and only if that is deeper than
+      `MIN_OVERLAP_METRES`.
+    * Links that touch each other now and then, such as two feet, get contact forces that depend on
+      small differences of their shapes and positions. Contacts with objects and with the
+      surroundings do not count.
+
+    Held-out runs are not used.
 
     Args:
         recording: Recording to check.
@@ -34,39 +45,60 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
     if not kind.has_model:
         return
     # This import is needed for robots only.
-    from sims.robot.contact_pairs import can_touch, iterate_poses
+    from sims.robot.contact_pairs import can_touch, iterate_poses, list_recorded_trees
 
     robot: Any = kind.robot  # type: ignore[attr-defined]
     model = robot.compiled
     if not can_touch(model):
         return
+    recorded_trees = list_recorded_trees(recording, kind)
     # Depth of the overlap in m in each pose with one, by the names of two bodies.
     depths: dict[tuple[str, str], list[float]] = {}
+    # Number of poses in which two links touch, by their names.
+    touches = Counter[tuple[str, str]]()
     pose_count = 0
     for run in recording.training():
         for data in iterate_poses(kind, run.channels):
             pose_count += 1
             deepest: dict[tuple[str, str], float] = {}
+            touching: set[tuple[str, str]] = set()
             for contact in data.contact[: data.ncon]:
-                bodies = [model.body(int(model.geom_bodyid[g])).name for g in contact.geom]
-                pair = min(bodies), max(bodies)
+                body_ids = model.geom_bodyid[contact.geom]
+                names = [model.body(int(body)).name for body in body_ids]
+                pair = min(names), max(names)
                 # The distance of a contact is negative if the geoms overlap.
                 deepest[pair] = max(deepest.get(pair, 0.0), -float(contact.dist))
+                are_links = recorded_trees.issuperset(model.body_treeid[body_ids].tolist())
+                if are_links and contact.dist < 0.0:
+                    touching.add(pair)
+            touches.update(touching)
             for pair, depth in deepest.items():
                 if depth > MIN_OVERLAP_METRES:
                     depths.setdefault(pair, []).append(depth)
-    for (body, other_body), values in depths.items():
-        if len(values) > MIN_OVERLAP_SHARE * pose_count:
-            if robot.format == "urdf":
-                remedy = "make their collision shapes smaller"
-            else:
-                remedy = f'add <contact><exclude body1="{body}" body2="{other_body}"/></contact>'
+    overlapping = {
+        pair: max(values)
+        for pair, values in depths.items()
+        if len(values) > MIN_OVERLAP_SHARE * pose_count
+    }
+    for (body, other_body), depth in overlapping.items():
+        if robot.format == "urdf":
+            remedy = "make their collision shapes smaller"
+        else:
+            remedy = f'add <contact><exclude body1="{body}" body2="{other_body}"/></contact>'
+        yield QualityFinding(
+            "overlap",
+            f"bodies {body} and {other_body} overlap by up to {1e3 * depth:.3g} mm in "
+            f"{len(depths[body, other_body]) / pose_count:.0%} of the recorded poses, so that a "
+            "contact force always acts between them",
+            f"{remedy} in {robot.path.name}",
+        )
+    for pair, count in touches.most_common(MAX_TOUCHING_PAIRS):
+        if count > MIN_TOUCHING_SHARE * pose_count and pair not in overlapping:
             yield QualityFinding(
-                "overlap",
-                f"bodies {body} and {other_body} overlap by up to {1e3 * max(values):.3g} mm in "
-                f"{len(values) / pose_count:.0%} of the recorded poses, so that a contact force "
-                "always acts between them",
-                f"{remedy} in {robot.path.name}",
+                "contact",
+                f"links {pair[0]} and {pair[1]} touch each other in {count / pose_count:.0%} of "
+                "the recorded poses, so that causes near them may not be found",
+                "record a motion in which the robot does not touch itself",
             )
 
 

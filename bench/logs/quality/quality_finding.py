@@ -12,7 +12,8 @@ class QualityFinding(NamedTuple):
     """One finding of a quality check.
 
     Attributes:
-        about: clock, drift, quantisation, saturation, stillness, contradiction, overlap or drive.
+        about: clock, drift, quantisation, saturation, stillness, contradiction, overlap,
+            contact or drive.
         text: Description of the finding, with its number.
         remedy: Recommended action.
     """

@@ -1,5 +1,7 @@
 """Tests of bodies that overlap in the recorded poses, and of drives that do nothing."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -45,6 +47,39 @@ def test_bodies_that_overlap_in_all_poses_are_named(height, more, depth, tmp_pat
     (finding,) = findings
     assert finding.text.startswith(f"bodies base and hip overlap by up to {depth} in 100% of the")
     assert finding.remedy == f"add {EXCLUDED} in leg.xml"
+
+
+FEET = """<mujoco model="feet"><worldbody>
+<body name="left" pos="0 0.1 1"><joint name="left" axis="1 0 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02"/></body>
+<body name="right" pos="0 -0.1 1"><joint name="right" axis="1 0 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02"/></body>
+</worldbody><actuator><motor name="l" joint="left"/><motor name="r" joint="right"/></actuator>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(("swing", "share"), [(0.5, 0.396), (0.1, None)])
+def test_links_that_touch_each_other_now_and_then_are_named(swing, share, tmp_path):
+    """Legs 0.2 m apart and 0.5 m long meet at an angle of arcsin(0.08 / 0.5) = 0.16 rad.
+
+    A sine of 0.5 rad is larger than this in 39.6 % of the time.
+    """
+    k = np.arange(120)
+    angle = swing * np.sin(2 * np.pi * k / 24)
+    description = describe(
+        {"q.left": "rad", "q.right": "rad", "u.l": "N*m", "u.r": "N*m"}, model="feet"
+    )
+    run = (k / 50, -angle, angle, 0 * k, 0 * k)
+    path = write_log(tmp_path, description, "q.left,q.right,u.l,u.r", [run], feet=FEET)
+    recording, kind = load_recording(path)
+    findings = [f for f in find_overlaps(recording, kind) if f.about == "contact"]
+    if share is None:
+        assert findings == []
+        return
+    (finding,) = findings
+    found = re.match(r"links left and right touch each other in (\d+)% of", finding.text)
+    assert found
+    assert int(found[1]) / 100 == pytest.approx(share, abs=0.05)
 
 
 def test_inspect_prints_overlaps_and_drives_that_do_nothing(tmp_path):
