@@ -573,7 +573,7 @@ def _loses_the_worker(error: BaseException | None) -> bool:
     )
 
 
-def _should_retry(call: _AssignedCall, error: BaseException | None, may_have_begun: bool) -> bool:
+def _should_retry(call: _AssignedCall, error: BaseException | None, may_have_started: bool) -> bool:
     """Return whether to repeat a call whose worker was killed or lost, and count the deaths.
 
     A pool that broke has not begun the call, or has not reported its result. A worker that was
@@ -583,7 +583,7 @@ def _should_retry(call: _AssignedCall, error: BaseException | None, may_have_beg
     Args:
         call: the call, whose number of deaths is increased in place.
         error: error with which it ended; None if it has a result.
-        may_have_begun: whether the worker may have begun the call when the pool broke.
+        may_have_started: whether the worker may have started the call when the pool broke.
     """
     # None unless the worker died during the call.
     code = _get_exit_code(error)
@@ -591,7 +591,7 @@ def _should_retry(call: _AssignedCall, error: BaseException | None, may_have_beg
         code in _EXTERNAL_KILL_EXIT_CODES and call.deaths < MAX_RETRIES
     )
     # A pool that broke has no exit code.
-    if is_repeated and (code is not None or may_have_begun):
+    if is_repeated and (code is not None or may_have_started):
         call.deaths += 1
     return is_repeated
 
