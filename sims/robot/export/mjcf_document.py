@@ -297,7 +297,8 @@ def compile_mjcf(text: str) -> Any:
         with capture_mujoco_warnings():
             model = mujoco.MjSpec.from_string(text).compile()
     except ValueError as error:
-        raise NotEditableError(f"MuJoCo refuses it: {' '.join(str(error).split())}") from None
+        message = " ".join(str(error).split()).removeprefix("Error: ")
+        raise NotEditableError(f"MuJoCo does not compile it ({message})") from None
     # The discarded spec held all meshes a second time.
     release_free_memory()
     return model

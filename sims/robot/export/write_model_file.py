@@ -67,7 +67,10 @@ def write_model_files(
         ).to_text()
     except NotEditableError as unfit:
         if robot.format == "mjcf":
-            notes.append(f"the MJCF is as MuJoCo writes it, not as {robot.path.name}: {unfit}")
+            notes.append(
+                f"MuJoCo wrote the MJCF, so it lacks the comments and order of {robot.path.name}, "
+                f"which cannot be edited: {unfit}"
+            )
         text = MjcfEditor(applied.robot, applied, recording, applied.text.encode()).to_text()
     urdf = None
     if robot.format == "urdf":
