@@ -171,6 +171,7 @@ def render_suite_page(tables: SuiteTables) -> str:
         "ert": tables.running_times,
         "profile": tables.profile,
         "ranks_common_targets": tables.ranks_over_common_targets,
+        "coverage": tables.coverage,
     }
     shown_frames = {name: frame for name, frame in frames.items() if len(frame)}
     page.add_tables(shown_frames)

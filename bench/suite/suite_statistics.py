@@ -418,7 +418,26 @@ class SuiteTables:
             "pairs": self.pairs,
             "ert": self.running_times,
             "profile": self.profile,
+            "coverage": self.coverage,
         }
+
+    @cached_property
+    def coverage(self) -> pd.DataFrame:
+        """Numbers of targets and seeds by method: on how many runs the errors are based.
+
+        Columns: tuner, cells, fewest and most targets of a cell, and the numbers of cells with one,
+        two, ... seeds in each target (``seeds_1``, ``seeds_2``, ...). Methods without random
+        numbers need one seed.
+        """
+        runs = self.suite.runs
+        # Of the targets of a cell, that with the fewest seeds counts.
+        seeds_of_target = runs.groupby(["tuner", "cell", "target"])["seed"].nunique()
+        seeds = seeds_of_target.groupby(["tuner", "cell"]).min()
+        cells = seeds.groupby("tuner").value_counts().unstack(fill_value=0).sort_index(axis=1)
+        targets = runs.groupby(["tuner", "cell"])["target"].nunique().groupby("tuner")
+        summary = targets.agg(cells="size", min_targets="min", max_targets="max")
+        table: pd.DataFrame = summary.join(cells.add_prefix("seeds_")).reset_index()
+        return table
 
 
 def _rank_tuners(medians: pd.DataFrame) -> pd.DataFrame:

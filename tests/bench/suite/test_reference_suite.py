@@ -62,3 +62,10 @@ def test_pages_state_the_headline_and_where_the_methods_lose(tables):
     for row in ranks[ranks["simulations"] == 100].itertuples():
         assert f"| `{row.tuner}` |" in readme
         assert f"| {row.mean_rank:.1f} |" in readme
+
+
+def test_readme_states_the_targets_and_seeds_of_each_method(tables):
+    readme = (FOLDER / "README.md").read_text(encoding="utf-8")
+    for row in tables.coverage.itertuples():
+        numbers = [row.min_targets, row.max_targets, row.seeds_1, row.seeds_3]
+        assert f"| `{row.tuner}` | {' | '.join(map(str, numbers))} |" in readme

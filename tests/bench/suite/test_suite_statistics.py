@@ -157,6 +157,26 @@ def test_losses_of_the_reference_methods():
     assert lines[2].startswith(f"tunenet {worse} 8 of 8 cells after 10 simulations: ")
 
 
+def test_coverage_counts_targets_and_the_fewest_seeds_of_each_cell():
+    suite = make_suite({cell: {"early": EARLY, "late": LATE} for cell in CELLS}, targets=5)
+    # A second seed of "late" on all targets of one cell, and on one target of another.
+    runs = suite.runs
+    is_second = (runs["tuner"] == "late") & (
+        (runs["cell"] == CELLS[0]) | ((runs["cell"] == CELLS[1]) & (runs["target"] == "in-002"))
+    )
+    second = runs[is_second].assign(seed=1)
+    suite = replace(
+        suite,
+        runs=pd.concat([runs, second], ignore_index=True),
+        errors=np.concatenate([suite.errors, suite.errors[is_second]]),
+    )
+    coverage = SuiteTables(suite).coverage.set_index("tuner")
+    assert coverage.loc["late"].to_dict() == {
+        "cells": 8, "min_targets": 5, "max_targets": 5, "seeds_1": 7, "seeds_2": 1,
+    }  # fmt: skip
+    assert coverage.at["early", "seeds_1"] == 8
+
+
 def test_failed_and_missing_runs_are_visible():
     curves = {cell: {"early": EARLY, "late": LATE} for cell in CELLS}
     curves[CELLS[0]]["broken"] = np.full(BUDGET + 1, np.inf)
