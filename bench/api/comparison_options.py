@@ -32,18 +32,19 @@ class StudyOptions:
     """Options of a comparison or of a sweep of comparisons.
 
     Attributes:
-        jobs: Number of worker processes; 0 runs everything in this process, without isolation, so
-            that output of print appears, breakpoints work, and classes of a notebook can be used.
+        jobs: Number of worker processes; 0 runs everything in this process without isolation, for
+            print, breakpoints and classes of a notebook.
         trust: Run the tuners without isolation: faster, but they could read the true parameters,
             and the results are marked.
         salt: Text from which the targets are drawn, secret until the end; `public` draws the
             published targets (default: a new one).
-        out: Folder to write, new or empty; a sweep writes one folder in it for each experiment
-            (default: a new folder below results/).
+        out: New or empty folder; a sweep writes one in it for each experiment (default: a new one
+            below results/).
         plugins: Plugin file with further tuners, simulators, effects or diagnosers.
         progress: Function that is called with a title and a number of steps; it returns the
             function that is called after each step.
-        force: Start even if it needs more than this machine has, or if the data are implausible.
+        force: Start even if this machine has too little memory, disk or time, or if the data are
+            implausible.
         pdf: Write every figure as PDF too (default: PNG only).
     """
 

@@ -197,23 +197,21 @@ class ShotConfig:
     """Pairs are ranges from which each shot draws.
 
     Attributes:
-        balls: kinds.
-        angle: of the incline, radians.
+        balls: kinds of balls.
+        angle: of the incline, rad.
         hoop_x: distance of the hoop's centre from the release, m.
-        hoop_drop: how far the hoop's plane lies below the height at which a ball's centre touches
-            the incline, m.
+        hoop_drop: distance of the hoop's plane below a ball's centre when it touches the incline,
+            m.
         hoop_radius: m.
         heights: drop heights that the planner may choose, m.
-        release: 1 sigma of the height and of the horizontal place of release, m.
-        planned_friction: what the planner takes for the friction of ball and incline, all balls
-            alike.
-        planned_inertia: what it takes for their moment of inertia over mass x radius^2.
-        friction: the world's.
-        filmed: height in pixels of the film from which the recorded drop is tracked
-            (`bounce_shot.drop_recording`); 0 for heights with the experiment's noise instead of a
-            film.
+        release: standard deviation of height and horizontal position of the release, m.
+        planned_friction: friction of ball and incline that the planner assumes for all balls.
+        planned_inertia: moment of inertia over mass x radius^2 that it assumes.
+        friction: true friction.
+        filmed: height in pixels of the film from which the recorded drop is tracked; 0 for heights
+            with the experiment's noise instead of a film.
         rows: tuners that get the pixel rows of the film instead of heights in metres, and not the
-            camera: those that compare simulated heights with rows, such as tunenet-vision.
+            camera, such as tunenet-vision.
     """
 
     balls: tuple[str, ...] = tuple(BALL_KINDS)

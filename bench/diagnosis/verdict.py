@@ -40,10 +40,10 @@ class Cause(Document):
         effect: Name of the effect.
         alternatives: Effects that explain the data as well, the most plausible first.
         says: Description of the effect in one sentence.
-        coefficients: Fitted coefficients with their 95 % intervals, by name.
+        coefficients: Fitted coefficients, by name.
         p_value: Probability of such a gain if the effect were absent.
         form: ``soft`` if dry friction has the solver parameters of the robot's model file, or
-            MuJoCo's defaults; left out where it is stiff, and for all other causes.
+            MuJoCo's defaults; left out where it is stiff, and for other causes.
     """
 
     effect: str
@@ -79,7 +79,7 @@ class HeldOutResult(Document):
     the data do not give is None.
 
     Attributes:
-        rmse_base: RMSE of the fitted base model, in `unit`.
+        rmse_base: RMSE of the fitted base model.
         rmse_extended: RMSE of the extended model.
         noise_floor: RMSE of a perfect model.
         gap_closed: (base - extended) / (base - floor).
@@ -137,7 +137,7 @@ class RecordingFault(Document):
         lines: For each signal, its table in the description and the keys to set.
         error_before: RMS residual of the base model on the fitted runs, in units of the noise; None
             if not measured.
-        error_after: RMS residual with the correction, in units of the noise; None if not measured.
+        error_after: This residual with the correction.
         alternatives: Other corrections that explain the recording as well, one sentence each.
     """
 
@@ -156,19 +156,18 @@ class Verdict(Document):
     """Verdict of explain.
 
     Attributes:
-        verdict: One of six words.
+        verdict: One of the six verdicts.
         system: System of the recording.
-        engine: Engine of the simulator; ``its own`` for a simulator with its own integrator.
+        engine: Engine of the simulator; ``its own`` if it has its own integrator.
         causes: Effects that the simulator lacks, strongest first.
-        parameters: Base parameters with their 95 % intervals, by name.
+        parameters: Base parameters, by name.
         heldout: Gain on held-out runs, or on runs left out in turn; None if there are neither, or
             the simulation failed.
         candidates: Effects of the library, best score first; empty if nothing was scored.
         next_experiment: Proposed next experiment; None if nothing is open.
         simulations: Number of simulations made.
-        seconds: Duration of the diagnosis in seconds.
-        cut: Early stop of the search, with the questions it skipped; None if the search was
-            complete.
+        seconds: Duration of the diagnosis.
+        cut: Early end of the search; None if it was complete.
         recording_faults: Wrong units or signs of the recording, because of which no cause was
             searched; left out where it is empty.
         recording_notes: Notes on samples of the recording, such as those with drives switched off;

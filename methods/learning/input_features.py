@@ -1,6 +1,6 @@
 """Input rows of the networks of learned tuners: features of an observation and of its scenario.
 
-Pure numpy, so that tuning needs no torch. `InputFeatures` joins both kinds of features.
+Pure numpy, so that tuning needs no torch.
 
 Features of an observation (`ObservationFeatures`). An observation (T, C) becomes a row of numbers
 in three steps: each run is resampled to a fixed number of points (RESAMPLE in Algorithm 1, arXiv
@@ -23,18 +23,17 @@ time:
     (5)  q'' = k0 + k1 q + k3 q^3 + kf sign(q') + ku u + kd q'
 
 The fit is in weak form (D. Messenger, D. Bortz, Weak SINDy, Multiscale Model. Simul. 19, 2021,
-doi:10.1137/20M1343166): both sides are multiplied by a bump w that is zero at both ends, and
+doi:10.1137/20M1343166): both sides are multiplied by a bump w that is zero at its ends, and
 integrated by parts, so that no noisy signal is differentiated twice:
 
     (6)  integral of w q'' = integral of w'' q,   integral of w q' = -integral of w' q
 
     (7)  w(s) = (1 - s^2)^4, s from -1 to 1 over the bump
 
-Initial values that no channel shows are inputs as they are. Input signals are not: appended to the
-observation they were measured to be worth next to nothing, since what a sample means depends on all
-inputs before it (docs/tunenet.md). The network reads how the observation responds to them, much the
-same whatever they were; and then that alone, since samples whose meaning changes from scenario to
-scenario only mislead.
+Initial values that no channel shows are inputs of the network. Input signals are not: appended to
+the observation they were of almost no use, since the meaning of a sample depends on all inputs
+before it (docs/tunenet.md). If the signals differ between scenarios, the network reads only the
+response to them, which depends little on the signals.
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
 """Pair network of TuneNet, its training, and the base class of the tuners that use it.
 
 The network has one branch for each of two observations; the branches are concatenated and followed
-by fully connected layers. `train_pair_network` trains its weights with torch, which is imported
-where it is needed; the forward pass used in tuning, `estimate_difference`, is plain numpy in double
-precision. `TrainedPairNetwork` is the network with its input features, `PairTuner` the tuner.
-Source: arXiv 1907.11200, section III and Eq. 1; layer sizes and training from the authors' released
-code.
+by fully connected layers. `train_pair_network` trains it with torch; tuning uses
+`estimate_difference`, a forward pass in numpy with double precision. Source: arXiv 1907.11200,
+section III and Eq. 1; layer sizes and training from the authors' released code.
 
 With a and b the input rows of the proposed and the target side, u the units, [ ] concatenation:
 
@@ -13,7 +11,8 @@ With a and b the input rows of the proposed and the target side, u the units, [ 
     (2)  h(a, b) = (n(a, b) - n(b, a)) / 2, so that h(o, o) = 0; published: h = n
     (3)  loss = mean |h - difference|^2 / (|difference|^2 + relative^2) + lambda |weights|^2
 
-Eq. 1 of the paper is (3) without the denominator: there the difference's size does not matter.
+Eq. 1 of the paper is (3) without the denominator, so that the size of the difference does not
+matter.
 """
 
 from __future__ import annotations

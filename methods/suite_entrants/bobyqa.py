@@ -16,7 +16,7 @@ from methods.tuner import Task, Tuner, TunerGenerator, from_callback
 
 @dataclass(eq=False)
 class BOBYQA(Tuner):
-    """Quadratic models of the loss in a trust region, from the start.
+    """BOBYQA (nlopt): quadratic models of the loss in a trust region, from the start.
 
     Attributes:
         step_tolerance: tolerance on the parameters at which it stops, in the unit cube.

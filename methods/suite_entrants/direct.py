@@ -19,7 +19,7 @@ FAILED_LOSS = 1e6
 
 @dataclass(eq=False)
 class DIRECT(Tuner):
-    """Division of the cube into boxes, locally biased; it begins at the centre of the cube."""
+    """DIRECT (nlopt): locally biased division of the cube into boxes, from its centre."""
 
     name: ClassVar[str] = "direct"
     requires: ClassVar[tuple[str, ...]] = ("nlopt",)

@@ -17,7 +17,7 @@ from methods.tuner import Array, Task, Tuner, TunerGenerator, from_callback
 
 @dataclass(eq=False)
 class MuJoCoSysId(Tuner):
-    """mujoco.sysid.optimize with its defaults, from the start; works with every simulator."""
+    """Least squares of mujoco.sysid (defaults), from the start; works with every simulator."""
 
     name: ClassVar[str] = "mujoco_sysid"
     requires: ClassVar[tuple[str, ...]] = ("mujoco", "colorama", "plotly")  # mujoco[sysid]

@@ -16,7 +16,7 @@ from methods.tuner import Task, Tuner, TunerGenerator
 
 @dataclass(eq=False)
 class NevergradNGOpt(Tuner):
-    """NGOpt with nevergrad's defaults; recommends the lowest loss."""
+    """NGOpt, nevergrad's choice of a method by dimension and budget; recommends the lowest loss."""
 
     name: ClassVar[str] = "nevergrad_ngopt"
     requires: ClassVar[tuple[str, ...]] = ("nevergrad",)

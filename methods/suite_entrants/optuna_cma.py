@@ -16,9 +16,9 @@ from methods.tuner import Task, Tuner, TunerGenerator
 
 @dataclass(eq=False)
 class OptunaCMA(Tuner):
-    """CMA-ES with Optuna's defaults; recommends the lowest loss.
+    """CMA-ES with Optuna's defaults (package `cmaes`, no margin); recommends the lowest loss.
 
-    With one parameter Optuna draws independent samples in place of CMA-ES.
+    For one parameter Optuna draws independent samples instead.
     """
 
     name: ClassVar[str] = "optuna_cma"

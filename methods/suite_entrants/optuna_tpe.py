@@ -15,7 +15,7 @@ from methods.tuner import Task, Tuner, TunerGenerator
 
 @dataclass(eq=False)
 class OptunaTPE(Tuner):
-    """TPE with Optuna's defaults; recommends the lowest loss.
+    """Tree-structured Parzen estimator with Optuna's defaults; recommends the lowest loss.
 
     Attributes:
         multivariate: model the parameters jointly, as Optuna's authors recommend.

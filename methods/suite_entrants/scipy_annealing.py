@@ -16,7 +16,7 @@ from methods.tuner import Array, Task, Tuner, TunerGenerator, from_callback
 
 @dataclass(eq=False)
 class DualAnnealing(Tuner):
-    """Dual annealing with SciPy's defaults, from the start."""
+    """Dual annealing and local search with SciPy's defaults, from the start."""
 
     name: ClassVar[str] = "scipy_annealing"
     requires: ClassVar[tuple[str, ...]] = ("scipy",)

@@ -16,10 +16,10 @@ from methods.tuner import Proposal, Task, Tuner, TunerGenerator
 
 @dataclass(eq=False)
 class SequentialNPE(Tuner):
-    """Rounds of simulations drawn from the posterior so far; recommends the posterior mean.
+    """Sequential neural posterior estimation (SNPE-C of sbi); recommends the posterior mean.
 
     Attributes:
-        rounds: number of rounds into which the budget is divided.
+        rounds: number of rounds, each with draws from the posterior so far.
     """
 
     name: ClassVar[str] = "snpe"

@@ -4,8 +4,8 @@ Sources: D. R. Jones, M. Schonlau, W. J. Welch, Efficient global optimization of
 functions, Journal of Global Optimization 13, 1998, doi:10.1023/A:1008306431147; T. Head et al.,
 scikit-optimize, doi:10.5281/zenodo.1157319.
 
-Where the Gaussian process predicts a loss of mean m and standard deviation s, and f is the lowest
-loss so far, the next point is that of the largest expected improvement:
+The Gaussian process predicts a loss of mean m and standard deviation s. With the lowest loss f so
+far, the next point has the largest expected improvement:
 
     (1)  EI = (f - m) Phi((f - m) / s) + s phi((f - m) / s)
 
@@ -28,18 +28,16 @@ class BayesianOptimisation(Tuner):
     """Bayesian optimisation (scikit-optimize) with a Gaussian process and expected improvement.
 
     It uses skopt.Optimizer with the Gaussian process of gp_minimize, one point at a time, and
-    recommends the lowest loss.
-
-    The library's defaults of `candidates`, `polished` and `fits` (10000, 5 and 2) take several
-    times as long and do not lower the errors on the bouncing ball.
+    recommends the lowest loss. The library's defaults of `candidates`, `polished` and `fits`
+    (10000, 5 and 2) take several times as long and do not lower the errors on the bouncing ball.
 
     Attributes:
         initial: points before the first model, the start included.
-        design: how they are chosen, by scikit-optimize's name of it.
+        design: scikit-optimize's name of their design.
         candidates: random points at which expected improvement is compared.
-        polished: how many of them are improved by L-BFGS.
-        fits: restarts of the fit of the process's hyper-parameters, beyond the first.
-        noise: variance of the losses' noise, or "gaussian" to fit it: a jagged loss looks noisy.
+        polished: number of these points that L-BFGS improves.
+        fits: restarts of the fit of the hyper-parameters, beyond the first.
+        noise: variance of the noise of losses, or "gaussian" to fit it: a jagged loss looks noisy.
     """
 
     name: ClassVar[str] = "bayes"

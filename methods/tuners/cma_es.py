@@ -5,8 +5,8 @@ Akimoto, P. Baudis, CMA-ES/pycma, doi:10.5281/zenodo.2559634; restarts with a gr
 Auger, N. Hansen, A restart CMA evolution strategy with increasing population size, CEC 2005,
 doi:10.1109/CEC.2005.1554902.
 
-pycma does the mathematics: points x = m + sigma N(0, C), and from those of the lowest losses a new
-mean m, step size sigma and covariance C. Here the ask-and-tell loop restarts it.
+pycma draws points x = m + sigma N(0, C), and computes from those with the lowest losses a new mean
+m, step size sigma and covariance C.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from methods.tuner import Array, Proposal, Task, Tuner, TunerGenerator
 
 @dataclass(eq=False)
 class CMAES(Tuner):
-    """CMA-ES in the unit cube.
+    """CMA-ES (pycma) in the unit cube.
 
-    pycma refuses a single parameter; there a second coordinate is added that the simulation
-    ignores. The published comparison let CMA-ES search the drop height too, although it was known;
-    its settings are `sigma=0.1, population=10, recommend="mean", evaluate_start=False`.
+    To a single parameter, which pycma refuses, a coordinate is added that the simulation ignores.
+    The published comparison let CMA-ES search the drop height too, although it was known; its
+    settings are `sigma=0.1, population=10, recommend="mean", evaluate_start=False`.
 
     Attributes:
-        sigma: first standard deviation, a share of the cube; pycma's manual advises about a quarter
-            of the range.
-        population: points in a generation; None for pycma's own choice.
-        recommend: the lowest loss seen, or the mean of the distribution.
-        evaluate_start: simulate the start before the first generation, as pycma's fmin does if
-            asked; pycma alone only draws points around it.
-        restarts: where pycma stops with budget left, start again at a random point with twice the
-            population, as far as the budget has room for it.
+        sigma: first standard deviation, a share of the cube; pycma's manual advises about a
+            quarter.
+        population: points in a generation; None for pycma's choice.
+        recommend: the lowest loss, or the mean of the distribution.
+        evaluate_start: simulate the start before the first generation; pycma alone only draws
+            points around it.
+        restarts: if pycma stops early, start again at a random point with twice the population, as
+            far as the budget allows.
     """
 
     name = "cma_es"

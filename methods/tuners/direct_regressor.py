@@ -1,4 +1,7 @@
-"""The direct regressor that TuneNet is compared with, arXiv 1907.11200, section III and Fig. 1."""
+"""The direct regressor that TuneNet is compared with.
+
+Source: arXiv 1907.11200, section III and Fig. 1.
+"""
 
 from __future__ import annotations
 
@@ -16,26 +19,23 @@ from methods.tuner import Proposal, Task, TunerGenerator
 class DirectRegressor(PairTuner):
     """Direct regression: a network estimates the parameters from the target alone.
 
-    It is TuneNet's network with zero in place of the proposed observation.
-
-    It needs no simulation of the target: it recommends its one estimate from the beginning,
-    simulates it, and stops.
+    It is TuneNet's network with zero in place of the proposed observation. It recommends its one
+    estimate from the beginning, simulates it, and stops.
 
     Attributes:
-        published: the network and training of the authors' released code; other options are ignored
-            except `points`.
+        published: network and training of the authors' released code; of the other options only
+            `points` counts.
         scenarios: training scenarios, at most as many as the budget allows.
         each: simulations in each scenario, at least 2 (dim + 1).
         points: points to which each run is resampled.
-        inputs: inputs kept of those an observation offers.
+        inputs: maximum number of features of an observation.
         strictness: see `methods.learning.input_features.make_weighted_features`.
         noise: as in `methods.tuners.tunenet.TuneNet`.
         epochs: passes over the training data.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
-        told: read what is known of the scenario too, where scenarios differ in it
-            (`methods.learning.input_features`).
-        channels: first and last channel that is read, by number, where targets do not show the
+        told: read also what is known of the scenario, if scenarios differ in it.
+        channels: first and last channel that is read, by number, if targets do not show the
             others; None for all.
         clean: as in `methods.tuners.tunenet.TuneNet`.
     """

@@ -1,19 +1,18 @@
 """Greedy entropy search: simulate where the minimiser of the error is most uncertain.
 
-Source: S. Zhu, A. Kimmel, K. E. Bekris, A. Boularias, Fast model identification via physics engines
-for data-efficient policy search, IJCAI 2018, doi:10.24963/ijcai.2018/451 (arXiv:1710.08893),
-algorithm 1.
+Source: S. Zhu et al., Fast model identification via physics engines for data-efficient policy
+search, IJCAI 2018, doi:10.24963/ijcai.2018/451 (arXiv:1710.08893), algorithm 1.
 
-The error over the parameters θ is a Gaussian process; P(θ) is the share of its posterior draws
-whose minimiser, among candidates, is θ; the next simulation is where
+The error as a function of the parameters θ is a Gaussian process. P(θ) is the share of its
+posterior draws whose minimiser among the candidates is θ. The next simulation is where
 
     (1)  -P(θ) log P(θ)
 
 is largest. Candidates are quasi-random points (`methods.learning.quasi_random_points`).
 
-As published the candidates are a fixed grid, which bounds the accuracy, and the search stops when
-its estimate repeats, which is often too early. The default draws new candidates each time, dense
-around the likely minimisers, models the logarithm of the error, and goes on.
+The published candidates are a fixed grid, which limits the accuracy, and the published search stops
+when its estimate repeats, often too early. The default draws new candidates each time, dense around
+the likely minimisers, models the logarithm of the error, and continues.
 """
 
 from __future__ import annotations
@@ -38,24 +37,22 @@ _LOSS_FLOOR_SHARE = 1e-6
 
 @dataclass(eq=False)
 class EntropySearch(Tuner):
-    """Greedy entropy search over a set of candidate points.
+    """Greedy entropy search: simulate where the minimiser of the error is most uncertain.
 
     It recommends the lowest loss so far, or with `published` the candidate with the largest P.
 
     Attributes:
-        published: the fixed grid over the cube (the authors of the comparison laid it between their
-            smallest and largest test target, which a tuner cannot know), the plain error, and the
-            stop.
-        grid: number of grid points, if published (quasi-random where there are several parameters).
+        published: fixed grid over the cube, plain error, and the stop (the authors' grid lay
+            between their smallest and largest test target, which a tuner cannot know).
+        grid: number of grid points, if published; quasi-random for several parameters.
         repeats_within: change of the estimate, a share of the cube, at which the published search
             stops.
         draws: draws of the posterior; 200 if published.
         initial: simulations before the first model, the start included.
         everywhere: candidates all over the cube.
-        nearby: candidates around the best point seen and the minimiser of the process's mean.
+        nearby: candidates around the best point and the minimiser of the process's mean.
         process: kernel and priors of the Gaussian process.
-        refit: with many simulations, the process's hyper-parameters are refitted after this number
-            of simulations.
+        refit: with many simulations, refit the hyper-parameters after this number of simulations.
     """
 
     requires = ("scipy",)

@@ -1,11 +1,11 @@
 """Hybrid tuner: TuneNet (arXiv 1907.11200) first, then Levenberg-Marquardt.
 
-The network's first steps are worth more than any search's, since it knows the simulator. Its last
-ones are not: outside its training range and under noise its estimate may settle where the
-simulation does not fit. The loss tells which it is.
+The network knows the simulator, so its first steps are better than those of any search. Outside its
+training range and with noise, its estimate may settle where the simulation does not fit, which the
+loss shows.
 
-The linear model with which the finish begins has a Jacobian J that explains what was simulated
-nearby, with steps s from the best point and changes y of the residual:
+Levenberg-Marquardt begins with a Jacobian J that explains the simulations nearby, with steps s from
+the best point and changes y of the residual, instead of finite differences:
 
     (1)  J s = y for each, by least squares
 """
@@ -45,16 +45,15 @@ _MIN_ORTHOGONAL_SHARE = 0.5
 
 @dataclass(eq=False)
 class TuneNetLeastSquares(TuneNet):
-    """TuneNet while each step divides the loss, then least squares from its simulations.
+    """TuneNet while its steps pay, then least squares from its simulations.
 
-    The finish begins at the lowest loss seen, with the secants of the points nearby in place of
-    finite differences. It fits all samples first, then with growing horizons, then from new starts
-    (`methods.tuners.least_squares`).
+    Least squares begins at the lowest loss. It fits all samples first, then growing horizons, then
+    from new starts (`methods.tuners.least_squares`).
 
     Attributes:
         pays: a network step pays if it brings the loss below this share of the lowest so far.
-        patience: the finish takes over after this many steps in succession that do not pay.
-        near: a simulated point counts as near up to this distance in any coordinate, unit cube.
+        patience: least squares begins after this many steps in succession that do not pay.
+        near: distance in any coordinate, unit cube, up to which a simulated point counts as near.
     """
 
     name: ClassVar[str] = "hybrid"

@@ -1,22 +1,20 @@
 """A network that sees the whole history of a tuning and proposes what to try next.
 
-The idea is CAPTURE's: X. Zhang, S. Liu, P. Huang, W. J. Han, Y. Lyu, M. Xu, D. Zhao, Dynamics as
-Prompts: In-Context Learning for Sim-to-Real System Identifications, IEEE Robotics and Automation
-Letters, 2025, arXiv 2410.20357. There a causal transformer P reads the last k iterations with their
-parameters e, actions a, simulated and real trajectories s and r,
+The idea is that of CAPTURE: X. Zhang et al., Dynamics as Prompts: In-Context Learning for
+Sim-to-Real System Identifications, IEEE Robotics and Automation Letters, 2025, arXiv 2410.20357.
+There a causal transformer P reads the last k iterations with their parameters e, actions a,
+simulated and real trajectories s and r,
 
     (1)  e_i = P(e_j, a_j, s_j, r_j for j = i - k ... i - 1)
 
-and learns to continue randomised binary searches (its Algorithm 1), whose targets are known, so
-that it goes on searching where none is. It needs no gradient and no training on the target.
+and learns to continue randomised binary searches with known targets (its Algorithm 1). It needs no
+gradient and no training on the target.
 
-What is kept: the history as context, the causal transformer, histories made by Algorithm 1 from the
-training range, the last k simulations as the window. What is not: the policy that chooses a new
-action at each step, since a target here is one observation. What is changed, because it measured
-better (docs/tunenet.md): the target's parameters are learned and not the search's next point; every
-simulation of a scenario serves as the target of the others, in any order; what is proposed is a
-step from the last simulation that vanishes with the difference of what they show; a first guess is
-made from the target alone. `published` takes these changes back.
+Here the policy that chooses an action at each step is left out, since a target is one observation.
+These changes measured better (docs/tunenet.md): P learns the target's parameters, not the next
+point of the search; every simulation of a scenario is the target of the others, in any order; a
+proposal is a step from the last simulation that vanishes with the difference of the observations;
+the first guess comes from the target alone. `published` undoes these changes.
 """
 
 from __future__ import annotations
@@ -123,26 +121,24 @@ class TrainedHistoryNetwork:
 class InContextTransformer(NoiseMatchedTuner[TrainedHistoryNetwork]):
     """Causal transformer that reads the tuning history and proposes the next point.
 
-    It is trained on simulated tuning histories, and recommends its newest proposal.
-
-    The first proposal comes from the target alone. A simulation that failed is left out of the
-    history.
+    It is trained on simulated tuning histories, and recommends its newest proposal. Failed
+    simulations are left out of the history.
 
     Attributes:
-        published: the published aim: it learns the next point of a randomised binary search, from
-            histories in their order, and begins at the start it is given.
-        window: simulations of the history that it looks back at.
+        published: learn the next point of a randomised binary search, from histories in their
+            order, and begin at the given start.
+        window: number of past simulations that it reads.
         scenarios: training scenarios, at most as many as the budget allows.
         each: simulations in each scenario, at least 2 (dim + 1): a target and a search for it.
         points: points to which each run is resampled.
-        inputs: inputs kept of those an observation offers.
+        inputs: maximum number of features of an observation.
         strictness: see `methods.learning.input_features.make_weighted_features`.
         noise: as in `methods.tuners.tunenet.TuneNet`.
-        epochs: passes over the training scenarios.
+        epochs: passes over the training data.
         rate: learning rate at the beginning.
-        weight_decay: times the squared norm of the weights, added to the loss.
+        weight_decay: factor of the squared norm of the weights in the loss.
         told: as in `methods.tuners.tunenet.TuneNet`.
-        channels: first and last channel that is read, by number; None for all.
+        channels: as in `methods.tuners.tunenet.TuneNet`.
         clean: as in `methods.tuners.tunenet.TuneNet`.
     """
 

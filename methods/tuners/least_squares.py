@@ -17,12 +17,11 @@ With r the residual at θ, J its Jacobian, s a step and D the diagonal of J^T J:
 
 (3) is Nielsen's rule.
 
-Two things go beyond the textbook. A small change of a parameter grows along a simulation until
-impacts fall into other time steps, so the residual as a whole is jagged, with many local minima,
-while its first part is smooth: the fit starts on the first samples of each run and takes in more of
-them step by step. (This is continuation from an easy problem to the hard one; C. Bunks et al. do it
-with the frequencies of seismic data, Geophysics 60(5), 1995, doi:10.1190/1.1443880.) And what
-remains of the budget is spent on new starts, far from everything tried so far.
+Two additions to the textbook: A small change of a parameter grows along a simulation until impacts
+fall into other time steps. Therefore the whole residual is jagged, with many local minima, while
+its first part is smooth. The fit starts on the first samples of each run and adds more step by step
+(continuation, as in C. Bunks et al. with the frequencies of seismic data, Geophysics 60(5), 1995,
+doi:10.1190/1.1443880). The rest of the budget is spent on new starts, far from all points tried.
 """
 
 from __future__ import annotations
@@ -67,28 +66,25 @@ _START_CANDIDATES = 64
 class LeastSquares(Tuner):
     """Levenberg-Marquardt with secant updates, a growing horizon and restarts.
 
-    It recommends the lowest loss so far.
-
-    `LeastSquares(horizons=(1.0,), secant=False, difference=1e-4, restart=False)` is the textbook's.
+    It recommends the lowest loss so far. The textbook's method is
+    `LeastSquares(horizons=(1.0,), secant=False, difference=1e-4, restart=False)`.
 
     Attributes:
-        horizons: shares of each run's samples to fit, one after another; (1.0,) fits all of them at
-            once.
-        secant: keep the Jacobian up to date with Broyden's formula, and take finite differences
-            anew only where that fails; otherwise take finite differences after every step that
-            succeeds.
+        horizons: shares of each run's samples to fit, one after another; (1.0,) fits all at once.
+        secant: update the Jacobian with Broyden's formula, and take finite differences only where
+            that fails; otherwise take them after every step that succeeds.
         difference: longest step of the finite differences, a share of the cube; it shrinks with the
-            fit's own steps.
+            steps of the fit.
         smallest_difference: its lower limit.
         damping: first damping, relative to the squared sensitivities.
         patience: a fit is stuck after this many steps in succession without progress.
         progress: share by which a step must lower the sum of squares to count as progress.
         step_tolerance: a fit has converged when its step is shorter than this share of the cube.
-        restart: whether to start again elsewhere when the target has not been reproduced.
-        reproduced: the target is reproduced when the loss is below this share of the observation's
+        restart: start again elsewhere if the target has not been reproduced.
+        reproduced: the target is reproduced if the loss is below this share of the observation's
             root mean square.
-        ahead: recommend a step before it is simulated where all samples are fitted and the last
-            step did what the model promised; otherwise the lowest loss seen.
+        ahead: recommend a step before its simulation if all samples are fitted and the last step
+            was as predicted; otherwise the lowest loss.
     """
 
     horizons: tuple[float, ...] = (0.0625, 0.09, 0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)

@@ -5,9 +5,8 @@ Sources: J. A. Nelder, R. Mead, A simplex method for function minimization, The 
 8(1), 1965, doi:10.1093/comjnl/8.1.42; S. G. Johnson, The NLopt nonlinear-optimization package,
 https://github.com/stevengj/nlopt.
 
-The simplex has dim + 1 corners; the worst is reflected through the middle of the others, and the
-new one is expanded, contracted, or all shrink towards the best. nlopt does that; here its questions
-are handed over.
+The simplex has dim + 1 corners. The worst is reflected through the middle of the others, and the
+new one is expanded, contracted, or all shrink towards the best.
 """
 
 from __future__ import annotations
@@ -23,12 +22,12 @@ from methods.tuner import Array, Task, Tuner, TunerGenerator, from_callback
 
 @dataclass(eq=False)
 class NelderMead(Tuner):
-    """nlopt's simplex from the start on; recommends the lowest loss seen.
+    """Nelder-Mead simplex in a box (LN_NELDERMEAD of nlopt); recommends the lowest loss.
 
     Attributes:
-        initial_step: edge of the first simplex, a share of the cube; None for nlopt's own choice,
-            which depends on the distance of the start from the bounds.
-        step_tolerance: nlopt's absolute tolerance on the parameters; 0 goes on to the limit of
+        initial_step: edge of the first simplex at the start, a share of the cube; None for nlopt's
+            choice, which depends on the distance from the bounds.
+        step_tolerance: nlopt's absolute tolerance on the parameters; 0 continues to the limit of
             rounding.
     """
 

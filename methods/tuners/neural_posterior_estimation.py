@@ -4,8 +4,8 @@ Sources: G. Papamakarios, I. Murray, Fast ε-free inference of simulation models
 conditional density estimation, NeurIPS 2016, arXiv 1605.06376; D. Greenberg, M. Nonnenmacher, J.
 Macke, Automatic posterior transformation for likelihood-free inference, ICML 2019, arXiv
 1905.07488; the flow: G. Papamakarios, T. Pavlakou, I. Murray, Masked autoregressive flow for
-density estimation, NeurIPS 2017, arXiv 1705.07057. Built and trained by the `sbi` package (JOSS
-5(52), 2020, doi:10.21105/joss.02505), which is an optional extra: pip install -e ".[npe]".
+density estimation, NeurIPS 2017, arXiv 1705.07057. Built and trained by the optional package `sbi`
+(JOSS 5(52), 2020, doi:10.21105/joss.02505): pip install -e ".[npe]".
 
 With θ drawn uniformly from the training range and o simulated from it, the flow q of weights w is
 trained by
@@ -33,23 +33,21 @@ from methods.tuner import Array, Proposal, Task, TrainingSimulator, Tuner, Tuner
 class NeuralPosteriorEstimation(Tuner):
     """Neural posterior estimation; recommends the posterior mean, then the best sample.
 
-    It simulates the mean of the learned posterior, then samples of it, and keeps the lowest loss.
-
-    It reads the same numbers of an observation as TuneNet does (`learning.input_features`),
-    of the target alone.
+    It simulates the mean of the learned posterior, then samples from it, and keeps the lowest loss.
+    It reads the input features of the target alone (`learning.input_features`).
 
     Attributes:
         scenarios: training scenarios, at most as many as the budget allows.
         each: simulations in each scenario, at least 2 (dim + 1).
         points: points to which each run is resampled.
-        inputs: inputs kept of those an observation offers.
+        inputs: maximum number of features of an observation.
         strictness: see `methods.learning.input_features.make_weighted_features`.
-        noise: sensor noise that every second training observation gets, 1 sigma, in units of each
+        noise: sensor noise of every second training observation, 1 sigma, in units of each
             channel's standard deviation in training.
         hidden: units of each layer of the flow.
         transforms: autoregressive layers of the flow.
-        epochs: passes over the training data at most; it stops when the held-out loss no longer
-            falls.
+        epochs: maximum number of passes over the training data; training stops when the held-out
+            loss no longer falls.
         draws: posterior samples behind the mean.
         told: as in `methods.tuners.tunenet.TuneNet`.
     """

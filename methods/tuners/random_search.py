@@ -15,7 +15,10 @@ from methods.tuner import Task, Tuner, TunerGenerator
 
 @dataclass(eq=False)
 class RandomSearch(Tuner):
-    """The start, then points drawn uniformly from the cube; recommends the lowest loss seen."""
+    """Random search: the start, then uniform points of the cube; recommends the lowest loss.
+
+    No tuner should be worse.
+    """
 
     name = "random"
     known_failures = {"check_beats_random_search": "it is random search"}  # noqa: RUF012

@@ -5,8 +5,7 @@ simulation and o_T of the target. Algorithm 1 repeats
 
     (1)  zeta_k = zeta_{k-1} + h(o_P, o_T)
 
-which stops at a root of h as a function of zeta, wherever that is. Here the root is sought by
-Broyden's method (`methods.learning.broyden_search`), whose first step is (1).
+which stops at a root of h as a function of zeta, wherever that is.
 """
 
 from __future__ import annotations
@@ -27,39 +26,34 @@ from methods.tuner import Proposal, Task, TunerGenerator
 class TuneNet(PairTuner):
     """Network that estimates the parameter difference from two observations.
 
-    It is trained on pairs of simulations.
+    It is trained on pairs of simulations, and recommends its newest guess.
 
-    Algorithm 1 adds that estimate to the guess, simulates the new guess, and repeats; it recommends
-    its newest guess.
-
-    The default differs from the published method in what the network sees
-    (`learning.input_features`), in its training (`pair_network.PairNetworkDesign`), in
-    h(o, o) = 0 by construction, and in the step: the estimates are read as the residuals of an
-    equation h = 0, solved by Broyden's method (Math. Comp. 19, 1965; in one dimension the secant),
-    which starts as Algorithm 1 does and converges where the network's scale is wrong, as outside
-    its training range.
+    The default differs from the published method in the input features
+    (`learning.input_features`), in the training (`pair_network.PairNetworkDesign`), in h(o, o) = 0
+    by construction, and in the step: it solves h = 0 by Broyden's method (in one dimension the
+    secant method, `methods.learning.broyden_search`), whose first step is (1). This converges also
+    if the network's scale is wrong, as outside its training range.
 
     Attributes:
         scenarios: training scenarios, at most as many as the budget allows.
         each: simulations in each scenario, at least 2 (dim + 1); every two of them are a training
             pair.
         points: points to which each run is resampled; L in Algorithm 1.
-        inputs: inputs kept of those an observation offers.
+        inputs: maximum number of features of an observation.
         strictness: see `methods.learning.input_features.make_weighted_features`.
-        noise: sensor noise that a second network prepares for, 1 sigma, in units of each channel's
-            standard deviation in training; used where the target is rougher than the simulations. 0
-            for no second network.
+        noise: sensor noise in the training of a second network, 1 sigma, in units of each channel's
+            standard deviation in training; it is used if the target is rougher than the
+            simulations. 0 for no second network.
         epochs: passes over the training data.
         rate: learning rate at the beginning.
         weight_decay: lambda in Eq. 1.
-        told: read what is known of the scenario too, where scenarios differ in it
-            (`methods.learning.input_features`).
-        channels: first and last channel that is read, by number, where targets do not show the
+        told: read also what is known of the scenario, if scenarios differ in it.
+        channels: first and last channel that is read, by number, if targets do not show the
             others; None for all.
         clean: whether targets may be as clean as simulations. False for a sensor whose errors last
-            for many samples: a smooth target is no clean one then, and there is one network,
+            for many samples: a smooth target need not be clean then, and there is one network,
             trained with `noise`.
-        broyden: solve h = 0; without it each step is that of Algorithm 1.
+        broyden: solve h = 0 by Broyden's method; False for the steps of Algorithm 1.
     """
 
     name: ClassVar[str] = "tunenet"

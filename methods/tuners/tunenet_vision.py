@@ -20,18 +20,19 @@ _LAST_CHANNEL = 1_000_000
 class TuneNetVision(TuneNet):
     """TuneNet with another sensor on the side of the target; the network learns the relation.
 
-    The proposed side reads the first channel of the simulation, as `z` of simulator ball-filmed;
-    the target's side reads the other channels of the target, as the pixel row `v`, and nothing of
-    what is known of the camera, as published. Gaps of the target are bridged by the proposed model
-    (`learning.gap_filling`). Where there is one channel both sides read it. Inputs, training
-    and the step are otherwise those of `methods.tuners.tunenet.TuneNet`; h(o, o) = 0 cannot hold by
-    construction, since no target is seen as a simulation is.
+    The proposed side reads the first channel of the simulation, such as `z` of simulator
+    ball-filmed. The target's side reads the other channels of the target, such as the pixel row
+    `v`, and nothing about the camera, as published. A single channel is read by both sides. The
+    proposed model fills gaps of the target (`learning.gap_filling`). Inputs, training and steps are
+    otherwise those of `methods.tuners.tunenet.TuneNet`; h(o, o) = 0 cannot hold by construction,
+    since no target is seen as a simulation is.
 
     Attributes:
         scenarios: training scenarios, each with a camera of its own, at most as many as the budget
             allows.
-        noise: of the tracker, 1 sigma, in units of the channel's standard deviation in training.
-        clean: as in TuneNet; a tracker's errors do last.
+        noise: noise of the tracker, 1 sigma, in units of the channel's standard deviation in
+            training.
+        clean: as in TuneNet; the errors of a tracker last.
         told: read what is known of the scenario, such as where the camera stands.
         channels: first and last channel that the target's side reads, by number.
     """

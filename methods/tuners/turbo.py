@@ -1,16 +1,15 @@
 """TuRBO-1: Bayesian optimisation in one trust region, with Thompson sampling.
 
-Sources: D. Eriksson, M. Pearce, J. Gardner, R. Turner, M. Poloczek, Scalable global optimization
-via local Bayesian optimization, NeurIPS 2019, arXiv 1910.01739 (section 2; constants from its
-supplement); M. Balandat et al., BoTorch: a framework for efficient Monte-Carlo Bayesian
-optimization, NeurIPS 2020, arXiv 1910.06403. Gaussian process and sampling are the `botorch`
-package's, which is an optional extra: pip install -e ".[turbo]".
+Sources: D. Eriksson et al., Scalable global optimization via local Bayesian optimization, NeurIPS
+2019, arXiv 1910.01739 (section 2; constants from its supplement); M. Balandat et al., BoTorch: a
+framework for efficient Monte-Carlo Bayesian optimization, NeurIPS 2020, arXiv 1910.06403. Gaussian
+process and sampling are from the optional package `botorch`: pip install -e ".[turbo]".
 
-The region is a box around the best point of sides
+The trust region is a box around the best point, with the sides
 
     (1)  length * l_i / (l_1 l_2 ... l_d)^(1/d)
 
-with the process's length scales l_i, so that its volume is length^d whatever they are.
+for the length scales l_i of the process, so that its volume is length^d.
 """
 
 from __future__ import annotations
@@ -48,11 +47,8 @@ It is small, because simulations are reproducible.
 class TuRBO(Tuner):
     """Trust-region Bayesian optimisation (TuRBO-1); recommends the lowest loss.
 
-    The trust region is a box around the best point. It grows with successes and shrinks with
-    failures.
-
-    Where the box has shrunk below its smallest length, it starts again elsewhere with new initial
-    points.
+    The trust region grows with successes and shrinks with failures. Below its smallest side, the
+    search starts again elsewhere with new initial points.
 
     Attributes:
         initial: points before the first model, per parameter, the start included; at least 2 in
@@ -60,7 +56,7 @@ class TuRBO(Tuner):
         candidates: points among which a Thompson sample is compared.
         length: first side of the trust region, unit cube.
         longest: its largest side.
-        shortest: below this side it starts again.
+        shortest: its smallest side.
         successes: improvements in succession after which the side is doubled; it is halved after as
             many failures in succession as there are parameters, at least 4.
     """

@@ -37,6 +37,7 @@ from sims.extended_simulator import FittedValue
 from tests.docs import documented_names, tuner_table
 from tests.docs.documentation_pages import DOCS, ROOT
 from tests.docs.page_numbers import inserted_numbers
+from tests.docs.schema_outline import INTERVAL_END, Outliner, sentence
 
 COMMAND = "python -m tests.docs.generate_pages"
 NOTE = f"<!-- Written by `{COMMAND}` from the code; change it there. -->"
@@ -51,6 +52,11 @@ def table(*rows):
     """Return a Markdown table; the first row is its header."""
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
+
+
+def bullets(rows):
+    """Return a Markdown list of names with their descriptions."""
+    return "\n".join(": ".join(filter(None, [f"- {name}", what])) for name, what in rows)
 
 
 def attributes(cls):
@@ -68,52 +74,101 @@ def summary(cls):
 # Commands.
 
 
+MIN_SHARING_COMMANDS = 4
+"""Minimum number of commands with an option that the page describes before all commands."""
+COMMON = "Common options"
+"""Heading of these options."""
+PLUGIN = "plugin file with further tuners, simulators, effects or diagnosers"
+"""Meaning of ``--plugin``, of which the help of a command names the part that it needs."""
+
+
 def commands():
     """Return the page of all commands with their options."""
     found = list_catalogue.list_commands(build_parser())
-    listing = [("command", "what it does")]
-    listing += [(f"[`{each['name']}`](#simgap-{each['name']})", each["says"]) for each in found]
-    codes = [
-        ("exit code", "meaning"),
-        *((str(code), says) for code, says in EXIT_CODES.items()),
-    ]
+    homes = option_homes(found)
+    common = [row for row, home in homes.items() if home == COMMON]
     parts = [
         "`simgap COMMAND --help` prints the same, `simgap list --json` as JSON. With `--json` "
-        "every command prints [one JSON document](json.md) to stdout and nothing else.",
-        table(*codes),
-        table(*listing),
+        "every command prints [one JSON document](json.md).",
+        "Exit codes:",
+        bullets((f"`{code}`", says) for code, says in EXIT_CODES.items()),
+        ", ".join(f"[`{each['name']}`](#simgap-{each['name']})" for each in found),
+        f"## {COMMON}",
+        bullets(common),
     ]
     for each in found:
-        parts += [f"## simgap {each['name']}", f"{sentence(each['says'])}", options(each)]
+        parts += [f"## simgap {each['name']}", sentence(each["says"]), *options(each, homes)]
     return page("Commands", *parts)
 
 
-def sentence(text):
-    """Write a help text as a sentence."""
-    return text[0].upper() + text[1:] + "."
+def option_homes(found):
+    """Return the section that describes each option: that of its first command, or the common one.
+
+    An option with another text in another command is another option.
+    """
+    commands_of = {}
+    for command in found:
+        for row in option_rows(command):
+            commands_of.setdefault(row, []).append(command["name"])
+    first = {}
+    for row, names in commands_of.items():
+        # Arguments without a flag are described in every command.
+        many = len(set(names)) >= MIN_SHARING_COMMANDS and row[0].startswith("`--")
+        first[row] = COMMON if many else names[0]
+    return first
 
 
-def options(command):
-    """Return a table of a command's arguments and options."""
-    rows = [("argument or option", "what")]
-    for option in command["options"]:
+def option_rows(command):
+    """Return name and description of each argument and option of a command."""
+    return [
+        (f"`{spelt(option)}`", describe_option(option))
+        for option in command["options"]
         # Every command has this option, and the top of the page describes it.
-        if option["flags"] == ["--json"]:
-            continue
-        what = option["says"].replace("|", "\\|")
-        if option["choices"]:
-            what = "; ".join(filter(None, [what, "one of " + ", ".join(option["choices"])]))
-        if option["repeatable"]:
-            what += "; may be repeated"
-        if option["required"] and option["flags"]:
-            what += " (required)"
-        rows.append((f"`{spelt(option)}`", what))
-    return table(*rows) if len(rows) > 1 else "No options but `--json`."
+        if option["flags"] != ["--json"]
+    ]
+
+
+def describe_option(option):
+    """Return what an argument or option does."""
+    what = PLUGIN if option["flags"] == ["--plugin"] else option["says"]
+    # argparse formats help texts, in which %% is a per cent sign.
+    what = what.replace("%%", "%")
+    if option["choices"] and not option["flags"]:
+        what += "; one of " + ", ".join(option["choices"])
+    # An option that takes several values need not be repeated.
+    if option["repeatable"] and not option["several"]:
+        what += "; may be repeated"
+    if option["required"] and option["flags"]:
+        what += " (required)"
+    return what
+
+
+def options(command, homes):
+    """Return a list of a command's own arguments and options, and references to the others."""
+    rows, elsewhere = {}, {}
+    for name, what in option_rows(command):
+        home = homes[name, what]
+        if home == command["name"] or not name.startswith("`--"):
+            rows.setdefault(what, []).append(name)
+        else:
+            elsewhere.setdefault(home, []).append(re.sub(" .*", "`", name))
+    parts = []
+    if rows:
+        parts.append(bullets((", ".join(names), what) for what, names in rows.items()))
+    links = {home: f"As for [`simgap {home}`](#simgap-{home})" for home in elsewhere}
+    links[COMMON] = f"[{COMMON}](#{COMMON.lower().replace(' ', '-')})"
+    if elsewhere:
+        parts.append(
+            " ".join(f"{links[home]}: {', '.join(names)}." for home, names in elsewhere.items())
+        )
+    return parts or ["No options but `--json`."]
 
 
 def spelt(option):
     """Return an option as it is typed on the command line."""
     metavar = option["metavar"]
+    if option["choices"] and option["flags"]:
+        metavar = f"{{{','.join(option['choices'])}}}"
     several = f"{metavar} ..." if option["several"] else metavar
     if not option["flags"]:
         return several if option["required"] else f"[{several}]"
@@ -127,43 +182,43 @@ LEFT_OUT = {"name", "label"}
 """Fields that are not keys: the experiment's name comes from its file, a label from its table."""
 REQUIRED = {"simulator"}
 """Fields whose default exists only in Python."""
-WORDS = {str: "text", int: "whole number", float: "number", bool: "`true` or `false`", Any: "value"}
+WORDS = {str: "string", int: "integer", float: "number", bool: "boolean", Any: "value"}
 
 
 def experiment_keys():
     """Return the page of all keys of an experiment file."""
     parts = [
         "An experiment is a TOML file. Name one of the project, or give the path of your own "
-        "(`simgap compare my.toml`). The keys are the fields of "
-        "`bench.benchmark.problem.experiment_config.Experiment`; `experiment.toml` of a comparison "
-        "contains all of them with their defaults. Unknown keys are errors. "
+        "(`simgap compare my.toml`). `experiment.toml` of a comparison contains all keys, which "
+        "are the fields of `simgap.Experiment`. Unknown keys are errors. Type and default are in "
+        "parentheses; a key without a type is a string. "
         "[Examples](../../bench/experiments), [what each tests](../problems.md).",
-        keys(Experiment, ""),
+        keys(Experiment),
     ]
     for name, hint in hints(Experiment).items():
         for cls in filter(dataclasses.is_dataclass, parts_of(hint)):
             # Several tables of one kind have a label each.
             whole = name if hint is cls or type(None) in get_args(hint) else f"{name}.LABEL"
-            parts += [f"## `[{whole}]`", summary(cls), keys(cls, f"{whole}.")]
+            parts += [f"## `[{whole}]`", summary(cls), keys(cls)]
     parts += [
         "## `[shot]`",
         "The scene of a [bounce shot](../bounce-shot.md). " + summary(ShotConfig),
     ]
-    parts += [keys(ShotConfig, "shot.")]
+    parts += [keys(ShotConfig)]
     return page("Keys of an experiment", *parts)
 
 
-def keys(cls, prefix):
-    """Return a table of a dataclass's fields: key, type, default and description."""
+def keys(cls):
+    """Return a list of a dataclass's fields: key, type with default, and description."""
     says = attributes(cls)
-    rows = [("key", "type", "default", *(["what"] if says else []))]
+    rows = []
     for field in dataclasses.fields(cls):
-        if field.name in LEFT_OUT:
-            continue
-        what = [says[field.name].replace("``", "`").removesuffix(".")] if says else []
-        kind = words(hints(cls)[field.name])
-        rows.append((f"`{prefix}{field.name}`", kind, default(field), *what))
-    return table(*rows)
+        if field.name not in LEFT_OUT:
+            kind = words(hints(cls)[field.name])
+            typed = ", ".join(filter(None, [kind if kind != "string" else "", default(field)]))
+            what = says.get(field.name, "").replace("``", "`").removesuffix(".")
+            rows.append((f"`{field.name}` ({typed})" if typed else f"`{field.name}`", what))
+    return bullets(rows)
 
 
 def hints(cls):
@@ -183,7 +238,7 @@ def words(hint):
         return f"table of {', '.join(f'`{name}`' for name in hint.__annotations__)}"
     origin, inner = get_origin(hint), [a for a in get_args(hint) if a not in (type(None), ...)]
     if dataclasses.is_dataclass(hint):
-        return "table, see below"
+        return "table below"
     if hint in WORDS:
         return WORDS[hint]
     if origin is Literal:
@@ -195,9 +250,7 @@ def words(hint):
         return f"table of {held}s" if inner[-1] in WORDS else f"table by name: {held}"
     if inspect.isclass(origin) and issubclass(origin, Sequence):
         return (
-            "tables, see below"
-            if dataclasses.is_dataclass(inner[0])
-            else f"list of {words(inner[0])}s"
+            "tables below" if dataclasses.is_dataclass(inner[0]) else f"list of {words(inner[0])}s"
         )
     return " or ".join(words(part) for part in inner)
 
@@ -212,9 +265,9 @@ def default(field):
     if value is dataclasses.MISSING:
         return "the label"
     if dataclasses.is_dataclass(value):
-        return "see below"
+        return ""
     if value is None or value in ("", (), {}):
-        return "none"
+        return ""
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
     if isinstance(value, tuple):
@@ -239,13 +292,13 @@ ESTIMATE = {
     "value": "fitted value",
     "unit": "unit of `value`, `low` and `high`",
     "low": "lower end of the 95 % interval; null if the data do not bound it",
-    "high": "upper end of the interval",
-    "at_bound": "bound at which the value ends (`low` or `high`); it then has no interval; absent "
-    "if the value lies inside its range",
-    "stated": "value in the robot's model file that the estimate changes, such as the damping of "
-    "a joint or the mass of a body; for an inertia tensor, its largest principal moment; absent "
-    "if the file has no such value",
-    "total": "this value including the estimate, as in extended.xml; absent if `stated` is absent",
+    "high": "upper end of the 95 % interval; null if the data do not bound it",
+    "at_bound": "end of the range at which the value is, `low` or `high`; it then has no interval; "
+    "absent if it is inside",
+    "stated": "value in the robot's model file that the estimate changes, such as a joint's "
+    "damping or a body's mass; for an inertia tensor, its largest principal moment; absent if the "
+    "file has none",
+    "total": "this value with the estimate, as in extended.xml; absent if `stated` is absent",
     "total_unit": "unit of `stated` and `total`; absent if equal to `unit`",
     "usual_range": "smallest and largest plausible value; absent if the value lies between them",
 }
@@ -256,22 +309,18 @@ def verdict_keys():
     """Return the page of the six verdicts, all keys of verdict.json, and the thresholds of the
     rules.
     """
-    words_of = [
-        ("verdict", "says"),
-        *((f"`{name}`", text) for name, text in VERDICT_MEANINGS.items()),
-    ]
     parts = [
-        "`simgap explain` writes `verdict.json`: one JSON object with exactly these keys; in "
-        "Python, `found.answer`. See [verdicts](../verdicts.md) for how a verdict is reached.",
+        "`simgap explain` writes `verdict.json`: one JSON object with these keys; in "
+        "Python, `found.answer`. A key without a type is a string. [Verdicts](../verdicts.md) "
+        "explains how a verdict is reached.",
         "## The six verdicts",
-        table(*words_of),
+        bullets((f"`{name}`", text) for name, text in VERDICT_MEANINGS.items()),
         "## The keys",
         json_keys(Verdict, attributes(Verdict)),
     ]
     for cls, name in KINDS.items():
         says = ESTIMATE if cls is FittedValue else attributes(cls)
         parts += [f"## {name[0].upper()}{name[1:]}", json_keys(cls, says)]
-    parts += ["`change` and `apart` are left out where no run is proposed."]
     parts += [
         "## Thresholds of the rules",
         "In `bench/diagnosis/search/verdict_rules.py`.",
@@ -289,13 +338,21 @@ OF_JSON = {
 
 
 def json_keys(cls, descriptions):
-    """Return a table of a dataclass's fields as keys of a JSON object."""
-    rows = [("key", "type", "what")]
+    """Return a table of a dataclass's fields as keys of a JSON object; equal ones share a row."""
+    names_of = {}
     for field in dataclasses.fields(cls):
         what = descriptions[field.name].replace("``", "`").replace("None", "null").removesuffix(".")
+        kind = of_json(hints(cls)[field.name])
+        # An optional key is left out instead of being null.
+        if "null" in what or field.metadata.get("optional"):
+            kind = kind.removesuffix(" or null")
         key = OF_JSON.get((cls.__name__, field.name), field.name)
-        rows.append((f"`{key}`", of_json(hints(cls)[field.name]), what))
-    return table(*rows)
+        names_of.setdefault((kind, INTERVAL_END.sub("ends of ", what)), []).append(f"`{key}`")
+    rows = [
+        (", ".join(names) + (f" ({kind})" if kind != "string" else ""), what)
+        for (kind, what), names in names_of.items()
+    ]
+    return table(("key", "what"), *rows)
 
 
 def of_json(hint):
@@ -304,19 +361,19 @@ def of_json(hint):
     if hint in KINDS:
         return KINDS[hint]
     if origin is Literal:
-        return "text"
+        return "string"
     if inspect.isclass(origin) and issubclass(origin, Mapping):
-        return f"object: by name, {of_json(inner[-1])}"
+        return f"{of_json(inner[-1]).removeprefix('a ').removeprefix('an ')}s by name"
     if inspect.isclass(origin) and issubclass(origin, Sequence):
         return f"list of {of_json(inner[0]).removeprefix('a ')}s"
     if inner:
         return " or ".join(of_json(part) for part in inner)
-    return "null" if hint is type(None) else WORDS[hint]
+    return "null" if hint is type(None) else JSON_KINDS[hint]
 
 
 def thresholds(module):
-    """Return a table of a module's numeric constants and their docstrings."""
-    rows = [("threshold", "value", "what")]
+    """Return a list of a module's numeric constants and their docstrings."""
+    rows = []
     # Python does not keep docstrings of constants, so they are read from the source.
     body = ast.parse(inspect.getsource(module)).body
     for statement, behind in pairwise(body):
@@ -324,8 +381,9 @@ def thresholds(module):
         if isinstance(statement, ast.Assign) and sentence_behind:
             (name,) = statement.targets
             value = ast.literal_eval(statement.value)
-            rows.append((f"`{name.id}`", f"{value:g}", " ".join(behind.value.value.split())))
-    return table(*rows)
+            what = " ".join(behind.value.value.split()).removesuffix(".")
+            rows.append((f"`{name.id} = {value:g}`", what))
+    return bullets(rows)
 
 
 # What commands print for programs.
@@ -371,6 +429,13 @@ def cell_schema(column):
     return cell
 
 
+OTHER_PAGES = {
+    **dict.fromkeys(ROWS, "[Columns](../results.md)."),
+    "verdict": "[Keys](verdict.md).",
+}
+"""Links for documents that other pages describe."""
+
+
 def json_documents():
     """Return the page of the JSON documents of all commands, made from the schemas."""
     commands_of = [each["name"] for each in list_catalogue.list_commands(build_parser())]
@@ -378,76 +443,25 @@ def json_documents():
     parts = [
         "`simgap COMMAND --json` prints one JSON document to stdout and nothing else; progress and "
         "warnings go to stderr. If the command fails, the document is [`error`](#error), and the "
-        "[exit code](commands.md) is not 0. Values that are not finite numbers are null; paths are "
-        "as given. `simgap schema NAME` prints the exact schema (JSON Schema, draft 2020-12); the "
-        "files are in `bench/schemas` and in the wheel. Later versions only add keys, so ignore "
-        "unknown ones.",
+        "[exit code](commands.md) is not 0. `simgap schema NAME` prints the exact schema (JSON "
+        "Schema, draft 2020-12); the files are in `bench/schemas` and in the wheel. Later versions "
+        "only add keys, so ignore unknown ones.",
+        "Each section is a command; the last ones are other documents. Indented keys belong to the "
+        "object above, or to each object of that list. Types are in parentheses; a plural is "
+        "a list. Without a type, *whether* is a boolean, *number of* an integer, anything else a "
+        "string. Numbers that are not finite are null; paths are as given.",
     ]
+    outliner = Outliner()
     for name in [*commands_of, *others]:
         known = load_schema(name)
-        parts += [f"## {name}", sentence(known["title"])]
-        if name == "verdict":
-            parts += ["Its keys have [a page of their own](verdict.md)."]
+        parts.append(f"## {name}")
+        if name in OTHER_PAGES:
+            parts.append(f"{sentence(known['title'])} {OTHER_PAGES[name]}")
             continue
-        if name in ROWS:
-            parts += ["Its columns are on the page [results](../results.md)."]
-            continue
-        parts += document_tables(known)
-    return page("What commands print for programs", *parts)
-
-
-def document_tables(known):
-    """Return the tables of a document's keys, one for each form it may have."""
-    forms = known.get("anyOf", [known])
-    parts = [sentence(known["description"])] if "description" in known else []
-    for form in forms:
-        rows = list(key_rows(form, ""))
-        parts.append(table(("key", "type", "what"), *rows) if rows else "Any keys.")
-    return parts
-
-
-def key_rows(known, before):
-    """Yield a row for each key, followed by rows for the keys of its value."""
-    for key, inner in known.get("properties", {}).items():
-        name = f"{before}{key}"
-        says = inner.get("description", "").replace("|", "\\|")
-        yield f"`{name}`", json_kind(inner), says
-        yield from inner_rows(inner, name)
-
-
-def inner_rows(inner, name):
-    """Yield rows for the keys inside a value: an object, a list of objects, or objects by name."""
-    for form in inner.get("anyOf", ()):
-        yield from inner_rows(form, name)
-    if "items" in inner:
-        yield from inner_rows(inner["items"], f"{name}[]")
-    elif isinstance(inner.get("additionalProperties"), dict):
-        yield from inner_rows(inner["additionalProperties"], f"{name}.NAME")
-    elif "properties" in inner:
-        yield from key_rows(inner, f"{name}.")
-
-
-def json_kind(known):
-    """Describe the type of a schema in words."""
-    if "const" in known:
-        return f"`{known['const']}`"
-    if "$ref" in known:
-        name = known["$ref"].partition(".")[0]
-        within = known["$ref"].partition("#")[2]
-        return f"a part of [`{name}`](#{name})" if within else f"[`{name}`](#{name})"
-    if "anyOf" in known:
-        return " or ".join(dict.fromkeys(json_kind(form) for form in known["anyOf"]))
-    kinds = known.get("type", "value")
-    kinds = [kinds] if isinstance(kinds, str) else kinds
-    if "enum" in known:
-        spelled = [f"`{word}`" for word in known["enum"] if word is not None]
-        return " or ".join([*spelled, *(["null"] if None in known["enum"] else [])])
-    words_of = {"string": "text", "integer": "whole number", "boolean": "true or false"}
-    if "items" in known:
-        words_of["array"] = f"list of {json_kind(known['items'])}"
-    if isinstance(known.get("additionalProperties"), dict):
-        words_of["object"] = f"by name: {json_kind(known['additionalProperties'])}"
-    return " or ".join(words_of.get(kind, kind) for kind in kinds)
+        if name not in commands_of:
+            parts.append(sentence(known["title"]))
+        parts += outliner.outline(name, known)
+    return page("JSON output of commands", *parts)
 
 
 # Tuners and public names.
@@ -457,9 +471,9 @@ def how_tuners_work():
     """Return the page of all tuners: method, equations, sources and options."""
     return page(
         "How each tuner works",
-        "Generated from the modules in `methods/`, whose code has the numbers of the equations. "
-        "[Choosing a tuner](../choosing-a-tuner.md) compares them; [add a "
-        "tuner](../add-a-tuner.md) shows how to write one.",
+        "[Choosing a tuner](../choosing-a-tuner.md) compares the tuners; [add a "
+        "tuner](../add-a-tuner.md) shows how to write one. The code in `methods/` has the numbers "
+        "of the equations. Options show their defaults.",
         "![Error against number of simulations](../../results/reference/ball-drop/figures/"
         "error-vs-simulations.png)",
         "*Ten tuners on the bouncing ball (`simgap compare ball-drop --salt public`). Each line is "
@@ -473,8 +487,8 @@ def public_names():
     return page(
         "Public names",
         "All names after `import simgap`, such as `simgap.compare`; [Python](../python.md) shows "
-        "how to use them together. A line that begins with `:::` says where a name is defined; the "
-        "site shows its signature and docstring there.",
+        "how to use them. A `:::` line says where a name is defined; the site shows signature and "
+        "docstring there.",
         *documented_names.sections(),
     )
 

@@ -110,9 +110,13 @@ SHARED = (
 """Modules below methods/learning that several tuners share."""
 LINKS = {
     r"\barXiv[: ](\d{4}\.\d{5})": r"[arXiv:\1](https://arxiv.org/abs/\1)",
-    r"\bdoi:(10\.[^\s,;]+[^\s,;.)])": r"[doi:\1](https://doi.org/\1)",
+    r"\bdoi:(10\.[^\s,;]+[^\s,;.:)])": r"[doi:\1](https://doi.org/\1)",
 }
 """Patterns of article identifiers, and their links."""
+REFERENCE_TUNER = "tunenet"
+"""Tuner whose options other learned tuners share."""
+AS_IN_REFERENCE = "as in `methods.tuners.tunenet.TuneNet`."
+"""Text of an option that is described there only."""
 
 
 def registered():
@@ -128,11 +132,17 @@ def sections():
     by_module = {}
     for name, module, kind in registered():
         by_module.setdefault(module, []).append((name, getattr(module, kind)))
+    reference = next(kind for [(name, kind), *_] in by_module.values() if name == REFERENCE_TUNER)
+    shared = describe_options(reference)
     parts = []
     for module, tuners in by_module.items():
-        parts += ["## " + ", ".join(f"`{name}`" for name, _ in tuners), *describe_module(module)]
+        parts.append("## " + ", ".join(f"`{name}`" for name, _ in tuners))
+        if len(tuners) == 1:
+            parts += describe_tuner(*tuners[0], module, shared)
+            continue
+        parts += describe_module(module)
         for name, kind in tuners:
-            parts += described(name, kind, alone=len(tuners) == 1)
+            parts += [f"### `{name}`", *split_docstring(kind), *options_of(name, kind, shared)]
     parts += ["## What learned tuners and searches share"]
     for name in SHARED:
         module = importlib.import_module(f"methods.learning.{name}")
@@ -140,11 +150,27 @@ def sections():
     return parts
 
 
+def describe_tuner(name, kind, module, shared):
+    """Return the docstrings of a tuner and of its module, and the options.
+
+    The module has no other tuner, so its summary says the same as that of the tuner.
+    """
+    summary, *rest = split_docstring(kind)
+    _, *background = paragraphs(inspect.cleandoc(module.__doc__))
+    head = f"{summary} {link_to(module)}"
+    return [head, *background, *rest, *options_of(name, kind, shared)]
+
+
 def describe_module(module):
     """Return a module's docstring as paragraphs and typeset equations, and a link to its file."""
-    text = inspect.cleandoc(module.__doc__)
+    summary, *rest = paragraphs(inspect.cleandoc(module.__doc__))
+    return [f"{summary} {link_to(module)}", *rest]
+
+
+def link_to(module):
+    """Return a link to the file of a module."""
     file = "/".join(module.__name__.split(".")) + ".py"
-    return [*paragraphs(text), f"Source: [`{file}`](../../{file})."]
+    return f"[`{file}`](../../{file})."
 
 
 def paragraphs(text):
@@ -165,15 +191,36 @@ def linked(text):
     return text
 
 
-def described(name, kind, alone):
-    """Return the docstring of a tuner's class, and a table of its options with their defaults."""
-    text, _, options = inspect.getdoc(kind).partition("Attributes:\n")
-    parts = [*([] if alone else [f"### `{name}`"]), *paragraphs(text.strip())]
+def split_docstring(kind):
+    """Return the paragraphs of a class's docstring, without those of its attributes."""
+    return [*paragraphs(inspect.getdoc(kind).partition("Attributes:\n")[0].strip())]
+
+
+def describe_options(kind):
+    """Return the description of each option of a tuner, in the order of the fields."""
+    options = inspect.getdoc(kind).partition("Attributes:\n")[2]
     says = dict(re.findall(r"^    (\w+): ((?:.|\n        )*)", options, re.M))
-    fields = [f for f in dataclasses.fields(kind) if f.name in says]
-    if fields:
-        rows = [f"| `{f.name}` | {default(f)} | {' '.join(says[f.name].split())} |" for f in fields]
-        parts.append("\n".join(["| option | default | what |", "|---|---|---|", *rows]))
+    names = [field.name for field in dataclasses.fields(kind) if field.name in says]
+    return {name: " ".join(says[name].split()) for name in names}
+
+
+def options_of(name, kind, shared):
+    """Return a list of a tuner's options with their defaults, and a line of those it shares."""
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    rows, elsewhere = [], []
+    for option, says in describe_options(kind).items():
+        assigned = f"`{option}={default(fields[option])}`"
+        reference = shared.get(option, "")
+        # The reference may add a clause to the description.
+        alike = {AS_IN_REFERENCE, reference, reference.partition(";")[0] + "."}
+        if name != REFERENCE_TUNER and says in alike:
+            elsewhere.append(assigned)
+        else:
+            rows.append(f"- {assigned}: {says.removesuffix('.')}")
+    parts = ["\n".join(rows)] if rows else []
+    if elsewhere:
+        link = f"[`{REFERENCE_TUNER}`](#{REFERENCE_TUNER})"
+        parts.append(f"Options as for {link}: {', '.join(elsewhere)}.")
     return parts
 
 
@@ -182,4 +229,4 @@ def default(field):
     value = field.default
     if field.default_factory is not dataclasses.MISSING:
         value = field.default_factory()
-    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
+    return f"{value:g}" if isinstance(value, float) else repr(value)

@@ -182,78 +182,71 @@ class Experiment:
     Attributes:
         name: file name without its ending.
         title: heading of figures.
-        says: a sentence on what it is.
-        identifiable: a sentence on what its data determine.
+        says: description in one sentence.
+        identifiable: what its data determine, in one sentence.
         tags: words by which a list is searched, e.g. ``quick``; they change nothing.
-        simulator: registered name; of a robot what tables call it, its file's name where empty.
-        model: a robot's model file (MJCF or URDF) in place of a registered simulator: relative to
-            the experiment's file, to the folder in $SIMGAP_ROBOTS, to that of `simgap download` or
-            to the working directory, or in an installed package as ``package://NAME/FILE``.
+        simulator: registered name; for a robot, its name in tables (default: that of its file).
+        model: model file of a robot (MJCF or URDF) instead of a registered simulator: relative to
+            the experiment's file, to $SIMGAP_ROBOTS, to the folder of `simgap download` or to the
+            working directory, or ``package://NAME/FILE`` in an installed package.
         free: numbers of the model file to tune, as ``damping@*`` or ``mass@forearm``.
-        actuators: that the model file lacks, as in a recording's ``[actuators.NAME]``.
-        observe: channels the tuner sees; all where empty.
-        error_channel: the channel in which `obs_error` and `heldout_error` are reported; the first
-            where empty.
+        actuators: those that the model file lacks, as in a recording's ``[actuators.NAME]``.
+        observe: channels that the tuner sees (default: all).
+        error_channel: channel of `obs_error` and `heldout_error` (default: the first).
         ranges: in, wide (simulated targets), or real (a recording).
         targets: number of targets in each range; for a recording, number of starting points.
         seeds: runs of each stochastic tuner on each target, and trainings of each learned one.
-        budget: simulations on one target.
+        budget: number of simulations on one target.
         negligible_error: error below which tuners count as equal when they are ranked and tested,
-            as a share of the training range (the unit of `param_error`); on a recording, where no
-            true parameters are known, the same share above the smallest error that any tuner
-            reached. The shipped experiments state a tenth of a percent, or the standard error that
-            their noise leaves where that is larger.
-        same_targets_as: another experiment whose targets are met; its own where empty.
-        training_budget: simulations that a learned tuner may train with.
-        timeout: seconds a run may take.
-        memory: MiB that a run may take in addition to its worker; 0 is no limit.
-        noise: standard deviation of the sensor noise added to simulated targets, by channel.
-        resolution: step to which the noisy samples of simulated targets are rounded, by channel.
-        settings: the simulator's own settings, e.g. its time step.
-        world: settings of the simulator that makes the targets, where it is another: another
-            engine, effects with fixed coefficients. Empty: the same simulator. Its parameters are
-            the first of the tuned ones.
-        constants: constants other than the simulator's defaults: a number, or [low, high] for
-            uniform between in each scenario, known to whoever simulates it.
-        parameters: changes to parameters' nominal, bounds, training range.
-        nuisance: effects that the simulator has not and the world may have, by coefficient, each
-            with the range from which it is drawn while a tuner trains whose entry says
-            ``randomised = true`` (`bench.benchmark.problem.training_simulator`).
-        initial: initial state: a number, or [low, high] for uniform between.
-        inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5``
-            (`bench.core.input_signals`).
+            as a share of the training range (the unit of `param_error`); for a recording, the same
+            share above the smallest error that any tuner reached. The shipped experiments state a
+            tenth of a percent, or the standard error that their noise leaves if that is larger.
+        same_targets_as: experiment whose targets are used (default: this one).
+        training_budget: number of simulations that a learned tuner may train with.
+        timeout: time limit of a run in seconds.
+        memory: memory limit of a run in MiB, in addition to its worker; 0 is no limit.
+        noise: standard deviation of the sensor noise of simulated targets, by channel.
+        resolution: quantisation step of the noisy samples of simulated targets, by channel.
+        settings: settings of the simulator, e.g. its time step.
+        world: settings of another simulator that makes the targets: another engine, or effects with
+            fixed coefficients (default: the same simulator). Its parameters are the first of the
+            tuned ones.
+        constants: constants that differ from the simulator's defaults; [low, high] is a uniform
+            draw in each scenario, known to whoever simulates it.
+        parameters: changes to parameters.
+        nuisance: effects that the simulator lacks and the world may have: by coefficient, the range
+            of the draws in the training of tuners with ``randomised = true``.
+        initial: initial state; [low, high] is a uniform draw.
+        inputs: input signals by name, as for `simgap simulate`, e.g. ``sine:2:0.5``.
         sampling: sample times of simulated targets.
-        held_out: unseen scenarios on which the tuned simulator's prediction is measured; for
+        held_out: unseen scenarios on which the prediction of the tuned simulator is measured; for
             simulated targets.
-        identifiability: whether to find what the data of each simulated target identify, where
-            there are several parameters (`problem.fisher_information`): two simulations a
-            parameter and target, in addition to all budgets.
-        recording: the measured data, for range real.
-        calibration: where tuners are compared twice, in the simulator as it is and in the one that
-            explain extends from such a recording (`bench.misspecification`).
-        shot: where the experiment is a bounce shot, its scene (`bounce_shot.shot_config`); targets
-            are then shots a ball.
-        diagnosis: where the experiment compares diagnosers, what is asked of whom
-            (`diagnosis_benchmark.case_set`); `budget`, `timeout` and `memory` are then
-            those of an answer, and there are no tuners.
-        isolation: run: every run of a tuner has a fresh process; tuner: all runs of a tuner with
-            one seed that a worker makes share one.
-        trusted: tuners run in the harness's own processes, where they can read everything;
+        identifiability: whether to find what the data of each simulated target identify, if there
+            are several parameters: two simulations per parameter and target, in addition to all
+            budgets.
+        recording: measured data, for range real.
+        calibration: compare the tuners twice: in the simulator as it is, and in the one that
+            `simgap explain` extends from such a recording.
+        shot: scene of a bounce shot; `targets` is then the number of shots with each ball.
+        diagnosis: cases and diagnosers of a comparison of diagnosers, which has no tuners;
+            `budget`, `timeout` and `memory` are then those of an answer.
+        isolation: run: a new process for every run of a tuner; tuner: one process for all runs of a
+            tuner with one seed in a worker.
+        trusted: whether tuners run in the processes of the harness, where they can read everything;
             tables and figures say so.
-        salt: what targets are drawn from; empty for a secret one, fresh for each comparison and
-            revealed at its end; ``public`` for the targets that everybody can draw; any other text
-            is as public as the file that it stands in.
-        salt_sha256: of the secret salt, from the beginning; a folder of results has it.
-        sweep: lists of values by key; the file stands for an experiment ``NAME[budget=10]`` for
-            each combination of them. A key within a table is joined by dots, as ``noise.x``.
-        experiments: others, by name or file, which it stands for: each with the targets, seeds,
-            budgets, limits and tuners of this one.
-        suite: name and version of the benchmark suite that the experiment belongs to; empty for
-            none.
-        problem_hashes: hash by name of each of the `experiments` of a suite, or of the questions
-            of a comparison of diagnosers (`compute_problem_hash`); a changed problem is refused.
-        tuners: a list of registered names, and of tables with ``tuner`` and, where two entries have
-            the same, a ``label``; or a table for each by its label.
+        salt: text from which targets are drawn (default: a secret one for each comparison, revealed
+            at its end); ``public`` draws the published targets; any other text is as public as its
+            file.
+        salt_sha256: hash of the secret salt, in a folder of results from the beginning.
+        sweep: lists of values by key, e.g. ``noise.x``; the file stands for an experiment
+            ``NAME[budget=10]`` for each combination.
+        experiments: other experiments, by name or file, for which the file stands: each with the
+            targets, seeds, budgets, limits and tuners of this one.
+        suite: name and version of the benchmark suite.
+        problem_hashes: hash by name of each of the `experiments` of a suite, or of the questions of
+            a comparison of diagnosers; a changed problem is refused.
+        tuners: list of registered names, and of tables with ``tuner`` and, if two entries have the
+            same, a ``label``; or a table for each label.
     """
 
     name: str

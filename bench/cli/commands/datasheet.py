@@ -29,8 +29,8 @@ def add_datasheet_arguments(parser: argparse.ArgumentParser) -> None:
         dest="explained",
         metavar="FOLDER",
         type=parse_path,
-        help="output folder of `simgap explain` for these logs (default: run explain now and write "
-        "its results into the folder explained in --out)",
+        help="output folder of `simgap explain` for these logs (default: explain them now, into "
+        "the folder explained in --out)",
     )
     add_pdf(parser)
     add_plugin_option(parser, "systems")

@@ -122,7 +122,7 @@ class EarlyStop(Document):
     """Early end of a search, as in verdict.json.
 
     Attributes:
-        reason: reason, ``budget`` or ``interrupt``.
+        reason: ``budget`` or ``interrupt``.
         during_question: the step that was running.
         skipped_questions: questions without an answer: ``base_fit``, ``search``, ``rivals``,
             ``held_out``, ``structure``, ``alternatives``.

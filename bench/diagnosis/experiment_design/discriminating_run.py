@@ -44,8 +44,9 @@ class DiscriminatingRun(Document):
     Attributes:
         says: Proposal as a sentence.
         change: By name, the differences from the first fitted run: seconds, an initial state, or
-            the factor of an input; None if no run is proposed.
-        apart: RMS difference of the two models in units of the noise; None if no run is proposed.
+            the factor of an input; left out where no run is proposed.
+        apart: RMS difference of the two models in units of the noise; left out where no run is
+            proposed.
     """
 
     says: str
