@@ -131,8 +131,6 @@ def option_rows(command):
 def describe_option(option):
     """Return what an argument or option does."""
     what = PLUGIN if option["flags"] == ["--plugin"] else option["says"]
-    # argparse formats help texts, in which %% is a per cent sign.
-    what = what.replace("%%", "%")
     if option["choices"] and not option["flags"]:
         what += "; one of " + ", ".join(option["choices"])
     # An option that takes several values need not be repeated.

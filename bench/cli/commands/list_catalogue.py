@@ -167,7 +167,8 @@ def _describe_option(action: argparse.Action) -> JsonDocument:
         "required": action.required,
         "several": action.nargs in ("+", "*"),
         "repeatable": isinstance(action, argparse._AppendAction | argparse._ExtendAction),
-        "says": action.help or "",
+        # argparse formats help texts, in which %% is a per cent sign.
+        "says": (action.help or "").replace("%%", "%"),
     }
 
 

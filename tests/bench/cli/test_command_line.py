@@ -334,3 +334,10 @@ def test_a_command_names_the_library_that_glfw_would_choose(monkeypatch):
     monkeypatch.setenv("PYGLFW_LIBRARY", "mine.so")
     main()
     assert os.environ["PYGLFW_LIBRARY"] == "mine.so"
+
+
+def test_listed_help_texts_have_no_format_characters():
+    commands = json.loads(run_command("list", "commands", "--json").out)
+    explain = next(each for each in commands["commands"] if each["name"] == "explain")
+    ranges = next(each for each in explain["options"] if each["name"] == "ranges")
+    assert "the 95 % intervals" in ranges["says"]
