@@ -62,6 +62,8 @@ _SECONDS_DIGITS = 2
 """Decimals of stored seconds."""
 _ERRORS_COLUMNS = ("lengths", "mantissas", "exponents")
 """Columns with the errors after 0, 1, ... simulations; see `_encode_errors`."""
+_SPLIT_COLUMNS = _ERRORS_COLUMNS[:2]
+"""Columns of the errors whose numbers have more than one byte."""
 _MIN_EXPONENT = -100
 """Smallest stored exponent."""
 _MISSING, _FAILED = 126, 127
@@ -344,7 +346,8 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), **digits})
     with atomic_replacement(folder / CURVES_FILE) as path:
         # Few errors occur twice, so that a dictionary of them takes more space than it saves. Each
-        # column is one page, because columns are compressed page by page.
+        # column is one page, because columns are compressed page by page. Bytes of the same
+        # significance are stored together, which saves a tenth.
         parquet.write_table(
             table,
             path,
@@ -352,6 +355,9 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
             compression_level=11,
             use_dictionary=False,
             data_page_size=2**26,
+            column_encoding={
+                f"{name}.list.element": "BYTE_STREAM_SPLIT" for name in _SPLIT_COLUMNS
+            },
         )
     texts = {CELLS_FILE: suite.cells, TRAINING_FILE: suite.training, SKIPPED_FILE: suite.skipped}
     for name, table_frame in texts.items():
