@@ -62,7 +62,7 @@ _SECONDS_DIGITS = 2
 """Decimals of stored seconds."""
 _ERRORS_COLUMNS = ("lengths", "mantissas", "exponents")
 """Columns with the errors after 0, 1, ... simulations; see `_encode_errors`."""
-_SPLIT_COLUMNS = _ERRORS_COLUMNS[:2]
+_SPLIT_COLUMNS = ("lengths", "mantissas")
 """Columns of the errors whose numbers have more than one byte."""
 _MIN_EXPONENT = -100
 """Smallest stored exponent."""

@@ -45,7 +45,7 @@ def check_log_quality(recording: Recording, kind: type[Simulator]) -> Iterator[Q
     yield from signal_checks.check_saturation(recording, kind)
     yield from signal_checks.check_standstill(recording, kind)
     yield from velocity_checks.check_velocities(recording, kind)
-    yield from pose_checks.find_overlaps(recording, kind)
+    yield from pose_checks.find_body_contacts(recording, kind)
 
 
 def check_recording_plausible(
@@ -74,8 +74,8 @@ def check_recording_plausible(
         *clock_checks.find_anomalies(recording, kind),
         *pose_checks.find_missing_base_poses(recording, kind),
         *(
-            Anomaly(overlap.text_line, False)
-            for overlap in pose_checks.find_overlaps(recording, kind)
+            Anomaly(contact.text_line, False)
+            for contact in pose_checks.find_body_contacts(recording, kind)
         ),
     ]
     for anomaly in anomalies:

@@ -6,7 +6,6 @@ initial pose.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -25,14 +24,13 @@ MAX_TOUCHING_PAIRS = 3
 """Maximum number of pairs of links that are reported for touching each other."""
 
 
-def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+def find_body_contacts(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
     """Find bodies of a robot that overlap in most of the recorded poses, or touch in some.
 
     * Contact forces between bodies that always overlap would act all the time, which is not
-      possible in a real robot: the shapes in the model file are too large. A pair counts at most
-      once in a pose, with its deepest contact, and only if that is deeper than
-      `MIN_OVERLAP_METRES`.
-    * Links that touch each other now and then, such as two feet, get contact forces that depend on
+      possible in a real robot: the shapes in the model file are too large. Only contacts deeper
+      than `MIN_OVERLAP_METRES` count.
+    * Links that sometimes touch each other, such as two feet, get contact forces that depend on
       small differences of their shapes and positions. Contacts with objects and with the
       surroundings do not count.
 
@@ -45,61 +43,73 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
     if not kind.has_model:
         return
     # This import is needed for robots only.
-    from sims.robot.contact_pairs import can_touch, iterate_poses, list_recorded_trees
+    from sims.robot.contact_pairs import can_touch, list_recorded_trees
 
     robot: Any = kind.robot  # type: ignore[attr-defined]
     model = robot.compiled
     if not can_touch(model):
         return
+    pose_count, depths = _measure_contact_depths(recording, kind)
     recorded_trees = list_recorded_trees(recording, kind)
-    # Depth of the overlap in m in each pose with one, by the names of two bodies.
-    depths: dict[tuple[str, str], list[float]] = {}
-    # Number of poses in which two links touch, by their names.
-    touches = Counter[tuple[str, str]]()
+    touching: list[tuple[float, str]] = []
+    for pair, values in depths.items():
+        body, other_body = sorted(model.body(number).name for number in pair)
+        overlaps = [depth for depth in values if depth > MIN_OVERLAP_METRES]
+        if len(overlaps) > MIN_OVERLAP_SHARE * pose_count:
+            if robot.format == "urdf":
+                remedy = "make their collision shapes smaller"
+            else:
+                remedy = f'add <contact><exclude body1="{body}" body2="{other_body}"/></contact>'
+            yield QualityFinding(
+                "overlap",
+                f"bodies {body} and {other_body} overlap by up to {1e3 * max(overlaps):.3g} mm in "
+                f"{len(overlaps) / pose_count:.0%} of the recorded poses, so that a contact force "
+                "always acts between them",
+                f"{remedy} in {robot.path.name}",
+            )
+        elif recorded_trees.issuperset(model.body_treeid[list(pair)].tolist()):
+            touching.append((len(values) / pose_count, f"links {body} and {other_body}"))
+    for share, links in sorted(touching, reverse=True)[:MAX_TOUCHING_PAIRS]:
+        if share > MIN_TOUCHING_SHARE:
+            yield QualityFinding(
+                "contact",
+                f"{links} touch each other in {share:.0%} of the recorded poses, so that causes "
+                "near them may not be found",
+                "record a motion in which the robot does not touch itself",
+            )
+
+
+def _measure_contact_depths(
+    recording: Recording, kind: type[Simulator]
+) -> tuple[int, dict[tuple[int, int], list[float]]]:
+    """Measure how deep bodies of a robot overlap in the recorded poses, without held-out runs.
+
+    Args:
+        recording: recording of the robot.
+        kind: simulator class of the robot.
+
+    Returns:
+        Number of poses; and by the numbers of two bodies the depth in m of their deepest contact in
+        each pose with one.
+    """
+    from sims.robot.contact_pairs import iterate_poses
+
+    model = kind.robot.compiled  # type: ignore[attr-defined]
     pose_count = 0
+    depths: dict[tuple[int, int], list[float]] = {}
     for run in recording.training():
         for data in iterate_poses(kind, run.channels):
             pose_count += 1
-            deepest: dict[tuple[str, str], float] = {}
-            touching: set[tuple[str, str]] = set()
+            deepest: dict[tuple[int, int], float] = {}
             for contact in data.contact[: data.ncon]:
-                body_ids = model.geom_bodyid[contact.geom]
-                names = [model.body(int(body)).name for body in body_ids]
-                pair = min(names), max(names)
+                first, second = sorted(model.geom_bodyid[contact.geom].tolist())
                 # The distance of a contact is negative if the geoms overlap.
-                deepest[pair] = max(deepest.get(pair, 0.0), -float(contact.dist))
-                are_links = recorded_trees.issuperset(model.body_treeid[body_ids].tolist())
-                if are_links and contact.dist < 0.0:
-                    touching.add(pair)
-            touches.update(touching)
+                if contact.dist < 0.0:
+                    depth = max(deepest.get((first, second), 0.0), -float(contact.dist))
+                    deepest[first, second] = depth
             for pair, depth in deepest.items():
-                if depth > MIN_OVERLAP_METRES:
-                    depths.setdefault(pair, []).append(depth)
-    overlapping = {
-        pair: max(values)
-        for pair, values in depths.items()
-        if len(values) > MIN_OVERLAP_SHARE * pose_count
-    }
-    for (body, other_body), depth in overlapping.items():
-        if robot.format == "urdf":
-            remedy = "make their collision shapes smaller"
-        else:
-            remedy = f'add <contact><exclude body1="{body}" body2="{other_body}"/></contact>'
-        yield QualityFinding(
-            "overlap",
-            f"bodies {body} and {other_body} overlap by up to {1e3 * depth:.3g} mm in "
-            f"{len(depths[body, other_body]) / pose_count:.0%} of the recorded poses, so that a "
-            "contact force always acts between them",
-            f"{remedy} in {robot.path.name}",
-        )
-    for pair, count in touches.most_common(MAX_TOUCHING_PAIRS):
-        if count > MIN_TOUCHING_SHARE * pose_count and pair not in overlapping:
-            yield QualityFinding(
-                "contact",
-                f"links {pair[0]} and {pair[1]} touch each other in {count / pose_count:.0%} of "
-                "the recorded poses, so that causes near them may not be found",
-                "record a motion in which the robot does not touch itself",
-            )
+                depths.setdefault(pair, []).append(depth)
+    return pose_count, depths
 
 
 def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:

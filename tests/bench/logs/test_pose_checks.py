@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.logs.quality.pose_checks import find_overlaps
+from bench.logs.quality.pose_checks import find_body_contacts
 from bench.logs.recording_loading import load_recording
 from tests.bench.diagnosis.simulated_logs import describe, write_log
 from tests.command_output import run_command
@@ -40,7 +40,7 @@ def test_bodies_that_overlap_in_all_poses_are_named(height, more, depth, tmp_pat
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     assert bool(data.ncon) == (depth is not None)
-    findings = list(find_overlaps(*load_recording(path)))
+    findings = list(find_body_contacts(*load_recording(path)))
     if depth is None:
         assert findings == []
         return
@@ -72,7 +72,7 @@ def test_links_that_touch_each_other_now_and_then_are_named(swing, share, tmp_pa
     run = (k / 50, -angle, angle, 0 * k, 0 * k)
     path = write_log(tmp_path, description, "q.left,q.right,u.l,u.r", [run], feet=FEET)
     recording, kind = load_recording(path)
-    findings = [f for f in find_overlaps(recording, kind) if f.about == "contact"]
+    findings = [f for f in find_body_contacts(recording, kind) if f.about == "contact"]
     if share is None:
         assert findings == []
         return
