@@ -198,7 +198,7 @@ class ShotConfig:
 
     Attributes:
         balls: kinds of balls.
-        angle: of the incline, rad.
+        angle: angle of the incline, rad.
         hoop_x: distance of the hoop's centre from the release, m.
         hoop_drop: distance of the hoop's plane below a ball's centre when it touches the incline,
             m.
@@ -206,8 +206,8 @@ class ShotConfig:
         heights: drop heights that the planner may choose, m.
         release: standard deviation of height and horizontal position of the release, m.
         planned_friction: friction of ball and incline that the planner assumes for all balls.
-        planned_inertia: moment of inertia over mass x radius^2 that it assumes.
-        friction: true friction.
+        planned_inertia: moment of inertia over mass x radius^2 that the planner assumes.
+        friction: true friction of ball and incline.
         filmed: height in pixels of the film from which the recorded drop is tracked; 0 for heights
             with the experiment's noise instead of a film.
         rows: tuners that get the pixel rows of the film instead of heights in metres, and not the

@@ -79,7 +79,7 @@ class HeldOutResult(Document):
     the data do not give is None.
 
     Attributes:
-        rmse_base: RMSE of the fitted base model.
+        rmse_base: RMSE of the fitted base model, in `unit`.
         rmse_extended: RMSE of the extended model.
         noise_floor: RMSE of a perfect model.
         gap_closed: (base - extended) / (base - floor).
@@ -137,7 +137,7 @@ class RecordingFault(Document):
         lines: For each signal, its table in the description and the keys to set.
         error_before: RMS residual of the base model on the fitted runs, in units of the noise; None
             if not measured.
-        error_after: This residual with the correction.
+        error_after: RMS residual with the correction, in units of the noise.
         alternatives: Other corrections that explain the recording as well, one sentence each.
     """
 
@@ -166,7 +166,7 @@ class Verdict(Document):
         candidates: Effects of the library, best score first; empty if nothing was scored.
         next_experiment: Proposed next experiment; None if nothing is open.
         simulations: Number of simulations made.
-        seconds: Duration of the diagnosis.
+        seconds: Duration of the diagnosis in seconds.
         cut: Early end of the search; None if it was complete.
         recording_faults: Wrong units or signs of the recording, because of which no cause was
             searched; left out where it is empty.

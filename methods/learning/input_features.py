@@ -31,7 +31,7 @@ integrated by parts, so that no noisy signal is differentiated twice:
     (7)  w(s) = (1 - s^2)^4, s from -1 to 1 over the bump
 
 Initial values that no channel shows are inputs of the network. Input signals are not: appended to
-the observation they were of almost no use, since the meaning of a sample depends on all inputs
+the observation, they hardly improved the estimates, since a sample depends on all inputs
 before it (docs/tunenet.md). If the signals differ between scenarios, the network reads only the
 response to them, which depends little on the signals.
 """

@@ -33,9 +33,9 @@ class BayesianOptimisation(Tuner):
 
     Attributes:
         initial: points before the first model, the start included.
-        design: scikit-optimize's name of their design.
+        design: scikit-optimize's name of the design of the initial points.
         candidates: random points at which expected improvement is compared.
-        polished: number of these points that L-BFGS improves.
+        polished: number of candidates that L-BFGS improves.
         fits: restarts of the fit of the hyper-parameters, beyond the first.
         noise: variance of the noise of losses, or "gaussian" to fit it: a jagged loss looks noisy.
     """

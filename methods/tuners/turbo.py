@@ -55,8 +55,8 @@ class TuRBO(Tuner):
             all.
         candidates: points among which a Thompson sample is compared.
         length: first side of the trust region, unit cube.
-        longest: its largest side.
-        shortest: its smallest side.
+        longest: largest side of the trust region.
+        shortest: smallest side of the trust region.
         successes: improvements in succession after which the side is doubled; it is halved after as
             many failures in succession as there are parameters, at least 4.
     """
