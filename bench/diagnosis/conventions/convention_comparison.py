@@ -385,8 +385,9 @@ class ConventionComparison:
         Filtering all runs is slow, so cheap tests come first:
 
         1. Find the run that the log as described explains worst, and compute the limits there.
-        2. Reject hypotheses by inverse dynamics, then by a filter, both on this run alone.
-        3. Compute the log-likelihood of the others on all runs.
+        2. Reject hypotheses by inverse dynamics on this run, and sort the others by its error.
+        3. Reject some by a filter of this run, and compute the log-likelihood of the others on all
+           runs, up to a number of filters.
 
         Args:
             recording: recording as it is described, or with some conventions corrected.
@@ -408,29 +409,30 @@ class ConventionComparison:
             log_likelihood_by_run[worst_run] + MIN_WORST_RUN_SHARE * LOG_LIKELIHOOD_MARGIN
         )
         force_error = self._compute_log_force_error(described, recording, worst_run)
-        best_by_description: dict[str, tuple[float, ConventionHypothesis]] = {}
-        evaluated_changes: list[object] = []
-        # Number of filters at which the comparison ends. Each log-likelihood needs one filter.
-        max_evaluations = self.evaluations + MAX_EVALUATIONS
+        # 2. Inverse dynamics, which takes far less time than a filter. Without forces to compare,
+        # the error is NaN or minus infinity, and rejects nothing; it is then counted as unchanged.
+        compared: list[tuple[float, ConventionHypothesis]] = []
+        known_changes: list[object] = []
         for hypothesis in self._generator.generate(recording, suspects):
+            # Several generators may propose one change in different words; it is compared once.
+            key = dict(hypothesis.changes), hypothesis.late
+            if key in known_changes:
+                continue
+            known_changes.append(key)
+            growth = self._compute_log_force_error(hypothesis, recording, worst_run) - force_error
+            if not growth > MAX_FORCE_ERROR_GROWTH:
+                compared.append((growth if np.isfinite(growth) else 0.0, hypothesis))
+        compared.sort(key=lambda pair: pair[0])
+        # 3. Filters, in ascending order of the error. Each log-likelihood needs one of them.
+        best_by_description: dict[str, tuple[float, ConventionHypothesis]] = {}
+        max_evaluations = self.evaluations + MAX_EVALUATIONS
+        for _, hypothesis in compared:
             if self.evaluations >= max_evaluations:
                 break
-            # Several generators may propose one change in different words; it is evaluated once.
-            key = dict(hypothesis.changes), hypothesis.late
-            if key in evaluated_changes:
-                continue
-            evaluated_changes.append(key)
-            # 2. Cheap tests. Without forces to compare, the growth is NaN or minus infinity, and
-            # rejects nothing.
-            force_error_growth = (
-                self._compute_log_force_error(hypothesis, recording, worst_run) - force_error
-            )
-            if force_error_growth > MAX_FORCE_ERROR_GROWTH:
-                continue
             worst_run_likelihood = self._compute_log_likelihood(hypothesis, recording, worst_run)
             if not worst_run_likelihood > min_worst_run_likelihood:
                 continue
-            # 3. All runs.
+            # All runs.
             score = self._compute_log_likelihood(hypothesis, recording)
             best_score, _ = best_by_description.get(hypothesis.description, (limit, hypothesis))
             if score > best_score:

@@ -36,10 +36,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from sims.core.simulator import Array
@@ -50,6 +52,11 @@ IndexArray = NDArray[np.intp]
 
 AR_FLOOR = 1e-3
 """White part of AR(1) noise, as a share of its variance, so that no reading is exact."""
+NEGLIGIBLE_SHARE = 1e-9
+"""Share of the largest entry of a row or column of a matrix below which an entry is rounding error.
+
+MuJoCo's solver couples joints of different limbs by its tolerance, which their derivatives contain.
+"""
 MAX_MAGNITUDE = 1e12
 """Maximum magnitude of derivatives and defects; larger ones come from divergence.
 
@@ -77,6 +84,22 @@ LARGEST_CHANGE = 10.0
 """Largest factor by which an iteration of (7) changes a standard deviation."""
 SMALLEST_FORCE = 1e-6
 """Minimum standard deviation of a missing force, as a share of the typical force."""
+
+
+class IndependentPart(NamedTuple):
+    """States, channels and forces that do not depend on those of other parts, such as a limb.
+
+    Attributes:
+        states: indices of its states.
+        channels: indices of the channels that measure them.
+        forces: indices of the missing forces that act on them.
+        runs: linear models of all runs with these alone.
+    """
+
+    states: IndexArray
+    channels: IndexArray
+    forces: IndexArray
+    runs: LinearRuns
 
 
 @dataclass(frozen=True)
@@ -108,6 +131,60 @@ class LinearRuns:
     def subset(self, chosen: IndexArray) -> LinearRuns:
         """Return some of the runs."""
         return self._map_arrays(lambda values: values[chosen])
+
+    @cached_property
+    def independent_parts(self) -> list[IndependentPart]:
+        """Parts of the model that are filtered by themselves; one part if all depends on all.
+
+        The cost of a filter grows with the cube of the number of states, and the limbs of a robot
+        with a fixed base do not influence each other.
+        """
+        state_count, (channel_count, _) = self.prior.size, self.readings.shape[2:]
+        force_count = self.forces.shape[3]
+        # Which states depend on which: edges of a graph whose nodes are states, channels, forces.
+        first_force = state_count + channel_count
+        edges = np.zeros((first_force + force_count,) * 2, dtype=bool)
+        edges[:state_count, :state_count] = self.states.any(axis=(0, 1))
+        edges[state_count:first_force, :state_count] = self.readings.any(axis=(0, 1))
+        edges[:state_count, first_force:] = self.forces.any(axis=(0, 1))
+        _, labels = connected_components(edges, directed=False)
+        # Channels and forces without a state are given to the first part that has one.
+        with_states = np.unique(labels[:state_count])
+        if with_states.size == 1:
+            indices = map(np.arange, (state_count, channel_count, force_count))
+            return [IndependentPart(*indices, self)]
+        labels[~np.isin(labels, with_states)] = with_states[0]
+        return [
+            self._select_part(
+                *(
+                    np.flatnonzero(kind == label)
+                    for kind in np.split(labels, [state_count, first_force])
+                )
+            )
+            for label in with_states
+        ]
+
+    def _select_part(
+        self, states: IndexArray, channels: IndexArray, forces: IndexArray
+    ) -> IndependentPart:
+        """Return the part of the model with some states, channels and forces.
+
+        Responses to inputs are left out, since no filter needs them.
+        """
+        arrays = {
+            "states": self.states[:, :, states[:, None], states],
+            "defects": self.defects[:, :, states],
+            "forces": self.forces[:, :, states[:, None], forces],
+            "inputs": self.inputs[:, :, :0],
+            "readings": self.readings[:, :, channels[:, None], states],
+            "residuals": self.residuals[:, :, channels],
+            "recorded": self.recorded[:, :, channels],
+            "prior": self.prior[states],
+            "jumps": self.jumps[:, :, states],
+        }
+        # Indexing changes the memory layout, which the compiled recursions expect.
+        runs = LinearRuns(**{name: np.ascontiguousarray(array) for name, array in arrays.items()})
+        return IndependentPart(states, channels, forces, runs)
 
     def segments(self, length: int) -> LinearRuns:
         """Split the runs into segments of `length` samples, each with the prior of a run.
@@ -168,6 +245,8 @@ class LinearRuns:
             # A step in which the model diverges gives no information on the next one.
             values[~(np.abs(values) < MAX_MAGNITUDE)] = 0.0
             stacked[name] = values
+        _remove_rounding_errors(stacked["states"], axis=3)
+        _remove_rounding_errors(stacked["forces"], axis=2)
         # Recorded minus predicted readings at the motion about which the models are linear.
         residuals = np.zeros(observed.shape)
         for run, run_maps in enumerate(maps):
@@ -312,6 +391,47 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     """
     if runs.states.shape[1] != runs.residuals.shape[1] - 1:
         raise ValueError(f"expected a step between two samples, got {runs.states.shape[1]} steps")
+    deviations = _complete_deviations(force, runs)
+    if len(runs.independent_parts) == 1:
+        return _filter_part(runs, deviations, white)
+    run_count, samples, channels = runs.residuals.shape
+    size = runs.prior.size
+    joined = Filtered(
+        predicted=np.zeros((run_count, samples, size)),
+        covariances=np.zeros((run_count, samples, size, size)),
+        innovations=np.zeros(runs.residuals.shape),
+        gains=np.zeros((run_count, samples, size, channels)),
+        whiteners=np.zeros((run_count, samples, channels, channels)),
+        log_likelihood=np.zeros(run_count),
+    )
+    for part in runs.independent_parts:
+        filtered = _filter_part(part.runs, deviations[:, part.forces], white[part.channels])
+        for name, index in _index_filtered(part).items():
+            getattr(joined, name)[index] = getattr(filtered, name)
+        joined.log_likelihood[:] += filtered.log_likelihood
+    return joined
+
+
+def _index_filtered(part: IndependentPart) -> dict[str, Any]:
+    """Return the index of a part's entries in each array of the results of the filter."""
+    states, channels = part.states, part.channels
+    return {
+        "predicted": np.s_[:, :, states],
+        "covariances": np.s_[:, :, states[:, None], states],
+        "innovations": np.s_[:, :, channels],
+        "gains": np.s_[:, :, states[:, None], channels],
+        "whiteners": np.s_[:, :, channels[:, None], channels],
+    }
+
+
+def _filter_part(runs: LinearRuns, deviations: Array, white: Array) -> Filtered:
+    """Follow one independent part of all runs, see `filter_runs`.
+
+    Args:
+        runs: the linear models of B runs.
+        deviations: (B, E) standard deviations of all columns of G.
+        white: (C,) variances of the white noise of C channels.
+    """
     # The residuals and rows of H of missing readings are zero already.
     variances = np.where(runs.recorded, white, 1.0)
     # The arguments of the compiled function are in the order of its signature. Its last results are
@@ -319,8 +439,8 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     predicted, covariances, innovations, gains, whiteners, likelihood, *_ = COMPILED.call(
         run_filter,
         *_make_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
-        *(np.square(runs.jumps), variances, runs.prior),
-        *(_complete_deviations(force, runs), np.array([LARGEST_COVARIANCE])),
+        *_make_contiguous(np.square(runs.jumps), variances, runs.prior, deviations),
+        np.array([LARGEST_COVARIANCE]),
     )
     # The likelihood of a model that diverges is zero; `>` is also false for NaN.
     likelihood = np.where(likelihood > -LARGEST_LOSS, likelihood, -np.inf)
@@ -339,10 +459,40 @@ def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
         filtered: results of the filter for these runs, with covariances.
         force: standard deviations of the missing forces, as for `filter_runs`.
     """
+    deviations = _complete_deviations(force, runs)
+    if len(runs.independent_parts) == 1:
+        return _smooth_part(runs, filtered, deviations)
+    joined = Smoothed(
+        states=np.zeros_like(filtered.predicted),
+        forces=np.zeros((*runs.defects.shape[:2], runs.forces.shape[3])),
+        score=np.zeros(runs.forces.shape[3]),
+    )
+    for part in runs.independent_parts:
+        part_of_filtered = Filtered(
+            **{
+                name: np.ascontiguousarray(getattr(filtered, name)[index])
+                for name, index in _index_filtered(part).items()
+            },
+            log_likelihood=filtered.log_likelihood,
+        )
+        smoothed = _smooth_part(part.runs, part_of_filtered, deviations[:, part.forces])
+        joined.states[:, :, part.states] = smoothed.states
+        joined.forces[:, :, part.forces] = smoothed.forces
+        joined.score[part.forces] = smoothed.score
+    return joined
+
+
+def _smooth_part(runs: LinearRuns, filtered: Filtered, deviations: Array) -> Smoothed:
+    """Smooth one independent part of all runs, see `smooth_runs`.
+
+    Args:
+        runs: the linear models of B runs.
+        filtered: results of the filter for this part.
+        deviations: (B, E) standard deviations of all columns of G.
+    """
     states, forces, measured, expected, *_ = COMPILED.call(
         run_smoother,
-        *_make_contiguous(runs.states, runs.forces, runs.readings),
-        _complete_deviations(force, runs),
+        *_make_contiguous(runs.states, runs.forces, runs.readings, deviations),
         *(filtered.predicted, filtered.covariances, filtered.innovations),
         *(filtered.gains, filtered.whiteners),
     )
@@ -397,6 +547,18 @@ def fit_process_noise(
         filtered = filter_runs(runs, force, white)
         smoothed = smooth_runs(runs, filtered, force)
     return force, filtered.without_covariances(), smoothed
+
+
+def _remove_rounding_errors(matrices: Array, axis: int) -> None:
+    """Set entries to zero that are negligible in their row (axis 3) or column (axis 2) of all runs.
+
+    Args:
+        matrices: (R, T - 1, rows, columns), which are changed.
+        axis: axis along which the largest entry is taken.
+    """
+    largest = np.abs(matrices).max(axis=(0, 1), initial=0.0)
+    is_negligible = largest <= NEGLIGIBLE_SHARE * largest.max(axis=axis - 2, keepdims=True)
+    matrices[:, :, is_negligible] = 0.0
 
 
 def _make_contiguous(*arrays: Array) -> tuple[Array, ...]:

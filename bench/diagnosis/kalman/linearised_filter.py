@@ -21,6 +21,7 @@ from bench.diagnosis.kalman.kalman_recursions import (
     MAX_MAGNITUDE,
     SMALLEST_FORCE,
     Filtered,
+    IndependentPart,
     LinearRuns,
     Smoothed,
     add_noise_states,
@@ -400,15 +401,25 @@ class FollowedRuns:
         wholly, but reduced to a negligible force, so that the filter stays well conditioned.
         """
         coloured, white = add_noise_states(self.runs, self.noise)
-        log_likelihood = self.log_likelihood
-        losses = []
-        for coordinate in range(self.force.size):
-            force = self.force.copy()
-            # Negligible: a tiny share of the typical force at this coordinate.
-            force[coordinate] = SMALLEST_FORCE * self.typical[coordinate]
-            filtered = filter_runs(coloured, force, white)
-            losses.append(2.0 * (log_likelihood - float(filtered.log_likelihood.sum())))
-        return np.array(losses)
+        losses = np.zeros(self.force.size)
+        # The likelihood of the other parts of the model does not change.
+        for part in coloured.independent_parts:
+            # Indices from `force.size` on are those of coloured noise.
+            coordinates = part.forces[part.forces < self.force.size]
+
+            def compute_log_likelihood(force: Array, part: IndependentPart = part) -> float:
+                """Return the log-likelihood of the part with these missing forces."""
+                filtered = filter_runs(part.runs, force, white[part.channels])
+                return float(filtered.log_likelihood.sum())
+
+            force = self.force[coordinates]
+            log_likelihood = compute_log_likelihood(force)
+            for index, coordinate in enumerate(coordinates.tolist()):
+                reduced = force.copy()
+                # Negligible: a tiny share of the typical force at this coordinate.
+                reduced[index] = SMALLEST_FORCE * self.typical[coordinate]
+                losses[coordinate] = 2.0 * (log_likelihood - compute_log_likelihood(reduced))
+        return losses
 
     @property
     def missing_forces(self) -> Mask:

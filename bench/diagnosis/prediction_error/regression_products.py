@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from bench.diagnosis.kalman.kalman_recursions import IndexArray
 from sims.core.simulator import Array
 
+MAX_SMALL_GROUP = 4
+"""Maximum number of columns of a group whose products are not computed by a matrix product."""
 SAMPLES_PER_BLOCK = 128
 """Number of samples that are converted to double precision together; they fit in the CPU cache."""
 
@@ -154,6 +156,12 @@ class ResponseProducts:
         # The sums of squares are known.
         if size == 1:
             result[:, 0, 0] = self.squares.sum(axis=0)[groups[:, 0]]
+            return result
+        if size > MAX_SMALL_GROUP:
+            for responses in self._responses:
+                for group, products in zip(groups, result, strict=True):
+                    chosen = responses[:, group].astype(np.float64)
+                    products += chosen.T @ chosen
             return result
         for _, _, block in self._iterate_blocks():
             members = [block[:, groups[:, i]] for i in range(size)]

@@ -96,14 +96,26 @@ def test_a_cause_is_no_broken_convention(cause, seed, tmp_path):
     assert check(log.path).differences() == []
 
 
+@pytest.mark.long
+def test_of_many_hypotheses_those_that_balance_forces_are_filtered_first(tmp_path):
+    """Six joints have more hypotheses than one round filters, and orders are proposed last."""
+    log = write_log(tmp_path / "log", 201, "exchanged both")
+    (difference,) = check(log.path).differences()
+    assert difference.description == "the channels and commands of j2, j5 look exchanged"
+
+
 def test_a_round_ends_after_a_number_of_filters(tmp_path, monkeypatch):
     (broken,) = QUICK
     log = write_log(tmp_path / "log", SEEDS[broken][0], broken)
-    monkeypatch.setattr(convention_comparison, "MAX_EVALUATIONS", 6)
+    monkeypatch.setattr(convention_comparison, "MAX_EVALUATIONS", 0)
     comparison = check(log.path)
     assert comparison.differences() == []
-    # The log as described is compared as a whole and in three parts before.
-    assert comparison.evaluations <= 4 + 6 + 1
+    # The log as described is compared as a whole and in its two parts for fitting before.
+    assert comparison.evaluations == 3
+    # The right hypothesis is among the first ones.
+    monkeypatch.setattr(convention_comparison, "MAX_EVALUATIONS", 6)
+    (difference,) = check(log.path).differences()
+    assert difference.description == SEEDS[broken][1]
 
 
 def test_an_identity_transform_is_no_difference(tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ from bench.diagnosis.kalman.kalman_recursions import (
     fit_process_noise,
     smooth_runs,
 )
+from sims.robot.dynamics.linearisation_about_recording import IntervalMaps
 
 SAMPLES, SIZE = 12, 2
 SIGMA, FORCE = 0.1, 0.7
@@ -127,6 +128,97 @@ def test_a_missing_sample_is_no_sample(residuals):
     own = covariance[np.ix_(there, there)]
     found = filter_runs(runs, np.array([FORCE]), np.array([SIGMA**2]))
     assert found.log_likelihood[0] == pytest.approx(log_likelihood(error, own), rel=1e-10)
+
+
+def join_runs(first, second, order, coupling=0.0):
+    """Return two one-channel models as one, whose states are in another order.
+
+    Args:
+        first: runs of a model.
+        second: the same number of runs of another model.
+        order: states of the result, as indices of those of the first model and then the second.
+        coupling: derivative of the first state of the second model by that of the first one.
+    """
+
+    def stack(name):
+        one, other = getattr(first, name), getattr(second, name)
+        shape = *one.shape[:2], one.shape[2] + other.shape[2], one.shape[3] + other.shape[3]
+        result = np.zeros(shape)
+        result[:, :, : one.shape[2], : one.shape[3]] = one
+        result[:, :, one.shape[2] :, one.shape[3] :] = other
+        return result
+
+    states = stack("states")
+    states[:, :, SIZE, 0] = coupling
+    joined = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)], axis=-1)
+        for name in ("residuals", "recorded")
+    }
+    by_state = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)], axis=-1)[..., order]
+        for name in ("defects", "jumps", "prior")
+    }
+    return LinearRuns(
+        states=states[:, :, order][..., order],
+        forces=stack("forces")[:, :, order],
+        inputs=stack("inputs")[:, :, order],
+        readings=stack("readings")[..., order],
+        **joined,
+        **by_state,
+    )
+
+
+def test_independent_parts_are_filtered_and_smoothed_like_models_of_their_own():
+    rng = np.random.default_rng(5)
+    singles = [
+        runs_of(rng.normal(size=(2, SAMPLES, 1)), prior, with_jumps=True)
+        for prior in ((0.5, 0.8), (0.1, 0.3))
+    ]
+    force, white = np.array([FORCE, 0.2]), np.array([SIGMA**2, 0.04])
+    # The states of the two models alternate.
+    order = [0, 2, 1, 3]
+    runs = join_runs(*singles, order)
+    parts = runs.independent_parts
+    assert [part.states.tolist() for part in parts] == [[0, 2], [1, 3]]
+    assert [(part.channels.tolist(), part.forces.tolist()) for part in parts] == [
+        ([0], [0]),
+        ([1], [1]),
+    ]
+    filtered = filter_runs(runs, force, white)
+    smoothed = smooth_runs(runs, filtered, force)
+    total = 0.0
+    for k, (single, states) in enumerate(zip(singles, ([0, 2], [1, 3]), strict=True)):
+        alone = filter_runs(single, force[[k]], white[[k]])
+        total = total + alone.log_likelihood
+        np.testing.assert_array_equal(filtered.predicted[..., states], alone.predicted)
+        np.testing.assert_array_equal(filtered.gains[:, :, states, k], alone.gains[..., 0])
+        # A reading says nothing about the states of the other part.
+        assert not filtered.gains[:, :, states, 1 - k].any()
+        np.testing.assert_array_equal(filtered.whitened[..., [k]], alone.whitened)
+        of_single = smooth_runs(single, alone, force[[k]])
+        np.testing.assert_array_equal(smoothed.states[..., states], of_single.states)
+        np.testing.assert_array_equal(smoothed.forces[..., [k]], of_single.forces)
+        np.testing.assert_array_equal(smoothed.score[[k]], of_single.score)
+    np.testing.assert_allclose(filtered.log_likelihood, total, rtol=1e-14)
+    # A coupled model is one part, with another result.
+    coupled = join_runs(*singles, order, coupling=1e-3)
+    assert len(coupled.independent_parts) == 1
+    changed = filter_runs(coupled, force, white).log_likelihood
+    assert (np.abs(changed - filtered.log_likelihood) > 1e-6).all()
+
+
+@pytest.mark.parametrize(("coupling", "part_count"), [(1e-11, 2), (1e-7, 1)])
+def test_rounding_errors_of_derivatives_do_not_couple_states(coupling, part_count):
+    single = runs_of(np.zeros((1, SAMPLES, 1)))
+    runs = join_runs(single, single, [0, 1, 2, 3], coupling)
+    maps = IntervalMaps(
+        **{name: getattr(runs, name)[0] for name in kalman_recursions.STACKED},
+        predicted=np.zeros((SAMPLES, 2)),
+    )
+    stacked = LinearRuns.stacked([maps], np.zeros((1, SAMPLES, 2)), runs.prior)
+    assert len(stacked.independent_parts) == part_count
+    kept = coupling if part_count == 1 else 0.0
+    np.testing.assert_array_equal(stacked.states[0, :, SIZE, 0], kept)
 
 
 @pytest.mark.parametrize("begin", [0.02, 20.0])

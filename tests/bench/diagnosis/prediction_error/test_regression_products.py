@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.prediction_error.regression_products import (
+    MAX_SMALL_GROUP,
     SAMPLES_PER_BLOCK,
     GramMatrices,
     ResponseProducts,
@@ -33,6 +34,9 @@ def compute_matrices(responses, innovations):
 def assert_equal_products(products, expected):
     """Assert that two objects have the same products, to the accuracy of double precision."""
     columns, groups = np.array([6, 0, 3, 6]), np.array([[0, 1, 5], [2, 2, 7]])
+    # Larger groups take another path.
+    large_groups = np.array([[7, 0, 1, 5, 3, 2], [2, 2, 7, 4, 6, 0]])
+    assert large_groups.shape[1] > MAX_SMALL_GROUP >= groups.shape[1]
     for get in (
         lambda p: p.squares,
         lambda p: p.crosses,
@@ -42,6 +46,7 @@ def assert_equal_products(products, expected):
         lambda p: p.select_rows(np.array([], dtype=np.intp)),
         lambda p: p.sum_within(groups),
         lambda p: p.sum_within(groups[:, :1]),
+        lambda p: p.sum_within(large_groups),
     ):
         found, right = get(products), get(expected)
         assert found.shape == right.shape
