@@ -151,8 +151,8 @@ class LinearRuns:
         # Channels and forces without a state are given to the first part that has one.
         with_states = np.unique(labels[:state_count])
         if with_states.size == 1:
-            indices = map(np.arange, (state_count, channel_count, force_count))
-            return [IndependentPart(*indices, self)]
+            channels, forces = np.arange(channel_count), np.arange(force_count)
+            return [IndependentPart(np.arange(state_count), channels, forces, self)]
         labels[~np.isin(labels, with_states)] = with_states[0]
         return [
             self._select_part(
