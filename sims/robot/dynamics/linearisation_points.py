@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,8 +44,15 @@ CONTACT_DIFFERENCE = 1e-6
 """Displacement in m of a floating body, for derivatives that show its contacts."""
 MAX_RELATIVE_CHANGE = 0.1
 """Maximum change of these derivatives for which one linearisation is used."""
+JOINT_TRANSMISSIONS = (0, 1)
+"""Types of MuJoCo's transmissions that act on one joint: mjTRN_JOINT, mjTRN_JOINTINPARENT."""
 TRANSMISSION_FORCE_FIELDS = ("qfrc_actuator", "qfrc_bias")
 """Fields of MuJoCo's data with the forces on both sides of a joint's transmission."""
+
+
+# The values are Any because floating bodies and hidden states take one index, others also arrays.
+Displacements = Mapping[str, tuple[Any, Any]]
+"""Index, or indices, and size of the displacement of each displaced quantity."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,43 @@ class RobotMotion:
     def velocities(self) -> Array:
         """All velocities (S + 1, D + F)."""
         return np.concatenate([self.v, self.floating_state.rate], axis=1)
+
+
+class LimbNumbers(NamedTuple):
+    """Number of the limb of each component of a robot with several limbs.
+
+    Attributes:
+        joints: (D,) of the joints.
+        controls: (nu,) of the controls.
+        activations: (na,) of the activations.
+        outputs: (O,) of the outputs.
+    """
+
+    joints: IndexArray
+    controls: IndexArray
+    activations: IndexArray
+    outputs: IndexArray
+
+    def get_number(self, quantity: str, index: int) -> int:
+        """Return the limb of a component.
+
+        Args:
+            quantity: ``u`` for a control, ``a`` for an activation; positions, velocities and forces
+                are those of joints.
+            index: number of the component among those of its quantity.
+        """
+        numbers = {"u": self.controls, "a": self.activations}.get(quantity, self.joints)
+        return int(numbers[index])
+
+    def number_results(self, size: int) -> IndexArray:
+        """Return the limb of each acceleration (D,), or of each component of a state (Z,).
+
+        Args:
+            size: number of these components.
+        """
+        if size == self.joints.size:
+            return self.joints
+        return np.concatenate([self.joints, self.joints, self.activations])
 
 
 class LinearisationPoints:
@@ -220,6 +265,35 @@ class LinearisationPoints:
         return bool(self._mujoco_batch.robot.contacts) and not self._floating
 
     @property
+    def limbs(self) -> LimbNumbers | None:
+        """Numbers of the limbs: kinematic trees that do not influence each other.
+
+        None if forces may pass between trees: through contacts, equality constraints, tendons,
+        drives that are not at a joint, or effects that are evaluated in every step.
+        """
+        model = self._mujoco_batch.model
+        is_passed_on = (
+            self.has_contacts
+            or bool(self._floating)
+            or any(self._step_effects)
+            or model.nv != self.motion.x.shape[1]
+            or bool(model.neq or model.ntendon or model.nplugin)
+            or not np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS).all()
+            or bool((self._joint_of_output < 0).any())
+        )
+        if is_passed_on or model.ntree < 2:
+            return None
+        of_joint = np.asarray(model.dof_treeid)[self._joints.velocities]
+        of_actuator = model.dof_treeid[model.jnt_dofadr[model.actuator_trnid[:, 0]]]
+        # Actuators with activations, in the order of these.
+        with_activation = np.flatnonzero(model.actuator_actadr >= 0)
+        order = np.argsort(model.actuator_actadr[with_activation], kind="stable")
+        of_activation = np.repeat(
+            of_actuator[with_activation[order]], model.actuator_actnum[with_activation[order]]
+        )
+        return LimbNumbers(of_joint, of_actuator, of_activation, of_joint[self._joint_of_output])
+
+    @property
     def steps_joints_by_runge_kutta(self) -> bool:
         """True if the integrator is the classical Runge-Kutta method, for joints alone.
 
@@ -235,7 +309,7 @@ class LinearisationPoints:
         )
 
     def step_displaced(
-        self, moved: Mapping[str, tuple[int, float]], acting: ActiveEffects, steps: int = 1
+        self, moved: Displacements, acting: ActiveEffects, steps: int = 1
     ) -> tuple[Array, Array]:
         """Make a step from each of N points, with displaced states or inputs.
 
@@ -289,7 +363,7 @@ class LinearisationPoints:
         self,
         acting: ActiveEffects,
         extra_forces: Array | None = None,
-        moved: Mapping[str, tuple[int, float]] | None = None,
+        moved: Displacements | None = None,
         at_centres: bool = False,
     ) -> tuple[Array, Array]:
         """Compute accelerations and readings at the state of each of N points, without a step.
@@ -348,7 +422,7 @@ class LinearisationPoints:
 
     def _place_points(
         self,
-        moved: Mapping[str, tuple[int, float]],
+        moved: Displacements,
         acting: ActiveEffects,
         at_centres: bool = False,
     ) -> Iterator[tuple[int, IndexArray | None]]:
@@ -362,7 +436,7 @@ class LinearisationPoints:
             moved: displacements for a difference quotient, index and size by quantity: ``q``
                 position of a joint, ``v`` its velocity, ``a`` activation, ``w`` hidden state of an
                 effect, ``p`` displacement of floating bodies, ``r`` their velocity, ``f`` force,
-                ``u`` control.
+                ``u`` control. Of all but ``w`` and ``p``, several may be displaced together.
             acting: active effects.
             at_centres: whether joints have the state of `_interval_centres`.
 
@@ -379,14 +453,15 @@ class LinearisationPoints:
         qpos, qvel, ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         applied = bind("qfrc_applied")
         has_activations = bool(motion.act.shape[1])
-        # Columns of MuJoCo's data of the quantities to which a displacement is simply added.
-        columns = {
-            "q": lambda k: qpos[:, joints.positions[k]],
-            "v": lambda k: qvel[:, joints.velocities[k]],
-            "f": lambda k: applied[:, self._dofs[k]],
-            "u": lambda k: ctrl[:, k],
-            "a": lambda k: bind("act")[:, k],
-            "r": lambda k: qvel[:, floating.velocities[k]],
+        # Fields of MuJoCo's data, and their columns, of the quantities to which displacements are
+        # simply added.
+        columns: dict[str, Callable[[Any], tuple[Array, Any]]] = {
+            "q": lambda k: (qpos, joints.positions[k]),
+            "v": lambda k: (qvel, joints.velocities[k]),
+            "f": lambda k: (applied, self._dofs[k]),
+            "u": lambda k: (ctrl, k),
+            "a": lambda k: (bind("act"), k),
+            "r": lambda k: (qvel, floating.velocities[k]),
         }
         # An actuator is switched off by a force range of zero.
         ranges: ForceRanges | None = None
@@ -421,7 +496,8 @@ class LinearisationPoints:
                 elif name == "w":
                     hidden_state_changes[k] = size
                 else:
-                    columns[name](k)[:point_count] += size
+                    field, column = columns[name](k)
+                    field[:point_count, column] += size
             self._add_effect_forces(steps, point_count, hidden_state_changes)
             yield point_count, self._mujoco_batch.get_element_ids(point_count)
 

@@ -21,14 +21,15 @@ Differential Equations II, 1996, section IV.2, doi:10.1007/978-3-642-05221-7),
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.robot.dynamics.linearisation_points import LinearisationPoints
+from sims.robot.dynamics.linearisation_points import LimbNumbers, LinearisationPoints
 
 POSITION_DIFFERENCE, VELOCITY_DIFFERENCE, CONTROL_DIFFERENCE, FORCE_DIFFERENCE_SHARE = (
     1e-6,
@@ -121,11 +122,29 @@ def compute_difference_quotients(
     else:
         evaluate = partial(points.step_displaced, acting=points.acting)
         unchanged_results, unchanged_readings = get_base_step()
+    # Limbs that do not influence each other are displaced together (A. R. Curtis, M. J. D. Powell,
+    # J. K. Reid, IMA J. Appl. Math. 13(1), 117, 1974, doi:10.1093/imamat/13.1.117).
+    limbs = points.limbs
     # Derivatives of results and of readings, for each of the three groups of displacements.
     quotients: list[tuple[Array, Array]] = []
     for group in displacements.values():
         derivatives = np.zeros((*unchanged_results.shape, len(group)))
         reading_derivatives = np.zeros((*unchanged_readings.shape, len(group)))
+        if limbs is not None:
+            for name, columns in _list_joint_displacements(group, limbs):
+                indices = np.array([group[column][1] for column in columns])
+                sizes = np.array([group[column][2] for column in columns])
+                results, readings = evaluate(moved={name: (indices, sizes)})
+                # Each limb shows the derivatives by its own displacement.
+                for column, index, size in zip(columns, indices, sizes, strict=True):
+                    limb = limbs.get_number(name, index)
+                    rows = limbs.number_results(results.shape[1]) == limb
+                    derivatives[:, rows, column] = (results - unchanged_results)[:, rows] / size
+                    rows = limbs.outputs == limb
+                    changes = readings - unchanged_readings
+                    reading_derivatives[:, rows, column] = changes[:, rows] / size
+            quotients.append((derivatives, reading_derivatives))
+            continue
         for column, (name, j, difference) in enumerate(group):
             results, readings = evaluate(moved={name: (j, difference)})
             forward = (results - unchanged_results) / difference
@@ -149,6 +168,28 @@ def compute_difference_quotients(
     return replace_diverging_points(
         DifferenceQuotients(by_state, by_force, by_control, *of_readings)
     )
+
+
+def _list_joint_displacements(
+    displacements: Sequence[tuple[str, int, float]], limbs: LimbNumbers
+) -> list[tuple[str, list[int]]]:
+    """List the displacements that are made together: of one quantity, and one of each limb.
+
+    Args:
+        displacements: quantity, index and size of each displacement.
+        limbs: limb of each component of the robot.
+
+    Returns:
+        Quantity, and the positions of its displacements in `displacements`.
+    """
+    # The number of earlier displacements of the same quantity and limb is that of the evaluation.
+    counts: Counter[tuple[str, int]] = Counter()
+    together: dict[tuple[str, int], list[int]] = {}
+    for column, (name, index, _) in enumerate(displacements):
+        key = name, limbs.get_number(name, index)
+        together.setdefault((name, counts[key]), []).append(column)
+        counts[key] += 1
+    return [(name, columns) for (name, _), columns in together.items()]
 
 
 def compute_runge_kutta_step(

@@ -5,10 +5,12 @@ import pytest
 
 from sims import effects as library
 from sims.core.simulator import Scenario
+from sims.robot.dynamics import tangent_propagation
 from sims.robot.dynamics.applied_inputs import compute_step_inputs
 from sims.robot.dynamics.linearisation_about_simulation import RunLinearisation
 from sims.robot.dynamics.step_jacobians import (
     DifferenceQuotients,
+    compute_difference_quotients,
     compute_runge_kutta_step,
     replace_diverging_points,
 )
@@ -242,3 +244,77 @@ def test_points_whose_difference_straddles_a_jump_get_the_quotients_of_the_neare
         np.testing.assert_array_equal(values.ravel(), [0, 1, 1, 3, 4, 4])
     kept = DifferenceQuotients(states[[0, 1, 3]], *(values[:3] for values in others))
     assert replace_diverging_points(kept) is kept
+
+
+def two_arms(rest="", actuator=""):
+    """Return a model file with two arms of two joints each, on one base.
+
+    Args:
+        rest: further elements of the model.
+        actuator: further actuator.
+    """
+    body, drives = ARM.partition("<worldbody>")[2].split("</worldbody>")
+    drives = drives.partition("<actuator>")[2].partition("</actuator>")[0]
+    names = ("upper_arm", "forearm", "shoulder", "elbow")
+    sides = {"left": (body, drives), "right": (body, drives)}
+    for side, texts in sides.items():
+        for name in names:
+            texts = [
+                text.replace(f'"{name}"', f'"{side}_{name}"').replace(
+                    f'"m_{name}"', f'"m_{side}_{name}"'
+                )
+                for text in texts
+            ]
+        sides[side] = texts
+    head = ARM.partition("<worldbody>")[0]
+    bodies, drives = ("".join(texts[k] for texts in sides.values()) for k in range(2))
+    return (
+        f"{head}<worldbody>{bodies}</worldbody>{rest}"
+        f"<actuator>{drives}{actuator}</actuator></mujoco>"
+    )
+
+
+COUPLED = '<equality><joint joint1="left_elbow" joint2="right_elbow"/></equality>'
+FILTERED = (
+    '<general name="slow" joint="left_elbow" dyntype="filter" dynprm="0.05" gainprm="2"'
+    ' biastype="none"/>'
+)
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
+@pytest.mark.parametrize("actuator", ["", FILTERED])
+@pytest.mark.parametrize(("rest", "has_limbs"), [("", True), (COUPLED, False)])
+def test_limbs_that_are_displaced_together_have_the_derivatives_of_each(
+    monkeypatch, integrator, actuator, rest, has_limbs
+):
+    channels = ("q.left_shoulder", "q.right_elbow", "tau.right_shoulder")
+    text = two_arms(rest, actuator)
+    kind = kind_of(text).with_integrator_settings(IntegratorSettings(0.002, integrator))
+    simulator = kind(observe=list(channels))
+    rng = np.random.default_rng(4)
+    inputs = {
+        channel.name: 0.4 * np.sin(rng.uniform(3, 9) * TIMES)
+        for channel in simulator.inputs
+        if channel.name.startswith("u.")
+    }
+    compared = []
+
+    def compare(points, sizes, get_base_step):
+        assert (points.limbs is not None) is has_limbs
+        before = points.placed_count
+        together = compute_difference_quotients(points, sizes, get_base_step)
+        after = points.placed_count
+        with monkeypatch.context() as patch:
+            patch.setattr(type(points), "limbs", None)
+            single = compute_difference_quotients(points, sizes, get_base_step)
+        compared.append((together, single, after - before, points.placed_count - after))
+        return together
+
+    monkeypatch.setattr(tangent_propagation, "compute_difference_quotients", compare)
+    RunLinearisation(simulator, np.zeros(0), Scenario(TIMES, {}, inputs), np.zeros(4), np.zeros(4))
+    ((together, single, few, many),) = compared
+    for one, other in zip(together, single, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6 * max(np.abs(other).max(initial=0), 1))
+    assert np.abs(single.read_states).max() > 1
+    # The unperturbed step is computed once, and counts for the first of the two.
+    assert few < 0.65 * many if has_limbs else few >= many
