@@ -41,7 +41,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
 from sims.core.simulator import Array
@@ -147,7 +146,7 @@ class LinearRuns:
         edges[:state_count, :state_count] = self.states.any(axis=(0, 1))
         edges[state_count:first_force, :state_count] = self.readings.any(axis=(0, 1))
         edges[:state_count, first_force:] = self.forces.any(axis=(0, 1))
-        _, labels = connected_components(edges, directed=False)
+        labels = _label_components(edges | edges.T)
         # Channels and forces without a state are given to the first part that has one.
         with_states = np.unique(labels[:state_count])
         if with_states.size == 1:
@@ -547,6 +546,25 @@ def fit_process_noise(
         filtered = filter_runs(runs, force, white)
         smoothed = smooth_runs(runs, filtered, force)
     return force, filtered.without_covariances(), smoothed
+
+
+def _label_components(edges: Mask) -> IndexArray:
+    """Return the smallest node (n,) of the connected component to which each node belongs.
+
+    SciPy's function would load a package for which `simgap explain` has no other use.
+
+    Args:
+        edges: (n, n) symmetric mask of the edges of a graph.
+    """
+    nodes = np.arange(len(edges))
+    is_neighbour = edges | np.eye(nodes.size, dtype=bool)
+    labels = nodes
+    while True:
+        # Each node takes the smallest label of its neighbours.
+        smallest: IndexArray = np.where(is_neighbour, labels, nodes.size).min(axis=1)
+        if np.array_equal(smallest, labels):
+            return labels
+        labels = smallest
 
 
 def _remove_rounding_errors(matrices: Array, axis: int) -> None:
