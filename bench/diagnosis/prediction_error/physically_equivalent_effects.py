@@ -1,8 +1,8 @@
 """List the effects that may act like a given one, for physical reasons.
 
 - A lag acts like a delay, and a command that comes late nearly like readings that come late.
-- The armature of a joint acts like the inertia of the link that it moves, and a payload near the
-  centre of mass like a heavier body.
+- The armature of a joint acts like the inertia of the link that it moves, or like its mass if the
+  axis is vertical, and a payload near the centre of mass like a heavier body.
 - The damping of a servo acts like that of its joint.
 - An effect at a joint may act like the same effect at another joint of its kinematic loop.
 - A payload near the axis of a joint, or at a joint that hardly moves, acts nearly alike on both
@@ -73,6 +73,8 @@ def list_similar_inertias(
     - The armature of a joint may act like the inertia of the link that it moves, and the reverse,
       if nothing else turns the link. The moment of inertia about the axis a is a' I a, with the
       tensor I about the centre of mass.
+    - A heavier link may act like the armature of a joint with a vertical axis, where gravity does
+      not show the mass.
     - A payload near the centre of mass of a body acts like a heavier body.
 
     The response to a large inertia or to the place of a payload is far from linear, so that a
@@ -82,7 +84,7 @@ def list_similar_inertias(
         evaluator: the runs.
         name: name of the effect, such as ``inertia.armature@elbow`` or ``payload@forearm``.
         coefficients: (k,) its coefficients; the first is an armature in kg·m², a relative change of
-            the link's inertia, or the mass of the payload in kg.
+            the link's mass or inertia, or the mass of the payload in kg.
 
     Returns:
         Names and coefficients (1,) of effects in the evaluator; empty for any other effect.
@@ -99,14 +101,21 @@ def list_similar_inertias(
             similar.append((f"mass.scale@{place}", coefficients[:1] / masses[place]))
     for joint, body in zip(simulator.robot.file_joints, list_moved_bodies(evaluator), strict=True):
         armature, scale = f"inertia.armature@{joint.name}", f"inertia.scale@{body}"
-        if name not in (armature, scale) or joint.kind != "hinge":
+        mass = f"mass.scale@{body}"
+        if name not in (armature, scale, mass) or joint.kind != "hinge":
             continue
         link, axis = model.body(body), model.jnt_axis[joint.id]
         (tensor,) = compute_inertia_tensors(link.iquat[None], link.inertia[None])
         moment = float(axis @ tensor @ axis)
-        # The armature adds to the moment of inertia, and the other effect changes it by a share.
-        other, factor = (scale, 1.0 / moment) if name == armature else (armature, moment)
-        similar.append((other, coefficients * factor))
+        # The armature adds to the moment of inertia, and the other effects change it by a share.
+        if name == armature:
+            similar.append((scale, coefficients / moment))
+            continue
+        # A heavier body also has a larger moment of its mass m about the axis, m |a x r|^2.
+        if name == mass:
+            offset = np.cross(axis, link.ipos - model.jnt_pos[joint.id])
+            moment += float(link.mass.item() * offset @ offset)
+        similar.append((armature, coefficients * moment))
     # Clip the coefficients to the bounds of the effects that the evaluator has.
     known = [(other, c) for other, c in similar if other in evaluator.coefficient_slices]
     bounds = [np.array(compute_coefficient_bounds(evaluator, other)).T for other, _ in known]

@@ -76,13 +76,20 @@ def test_an_armature_is_reported_with_the_inertia_of_the_link_that_acts_alike(lo
     assert cause.coefficients["coefficient"].value == pytest.approx(0.17, rel=0.05)
 
 
-@pytest.mark.parametrize("name", ["inertia.armature@elbow", "inertia.scale@forearm"])
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("inertia.armature@elbow", "inertia.scale@forearm"),
+        ("inertia.scale@forearm", "inertia.armature@elbow"),
+        ("mass.scale@forearm", "inertia.armature@elbow"),
+    ],
+)
 def test_an_inertia_and_the_armature_that_acts_alike_change_the_mass_matrix_alike(
-    example_arm, name
+    example_arm, name, expected
 ):
     robot = example_arm.simulator.robot
     ((other, coefficients),) = list_similar_inertias(example_arm, name, np.array([0.004]))
-    assert {name, other} == {"inertia.armature@elbow", "inertia.scale@forearm"}
+    assert other == expected
     changes = {name: 0.004, other: float(coefficients[0])}
     model = mujoco.MjModel.from_xml_path(str(robot.path))
     dof, body = model.joint("elbow").dofadr[0], model.body("forearm").id
@@ -94,8 +101,12 @@ def test_an_inertia_and_the_armature_that_acts_alike_change_the_mass_matrix_alik
         return float(matrix[dof, dof])
 
     before = inertia_of_joint()
-    model.body_inertia[body] *= 1.0 + changes["inertia.scale@forearm"]
-    assert inertia_of_joint() - before == pytest.approx(changes["inertia.armature@elbow"], rel=1e-9)
+    armature = changes.pop("inertia.armature@elbow")
+    ((effect, share),) = changes.items()
+    model.body_inertia[body] *= 1.0 + share
+    if effect == "mass.scale@forearm":
+        model.body_mass[body] *= 1.0 + share
+    assert inertia_of_joint() - before == pytest.approx(armature, rel=1e-9)
 
 
 def test_a_payload_may_be_a_heavier_body(example_arm):
@@ -108,7 +119,7 @@ def test_a_payload_may_be_a_heavier_body(example_arm):
 
 
 def test_other_effects_have_no_similar_inertia(example_arm):
-    for name in ("drag.linear@elbow", "mass.scale@forearm", "inertia.armature@*"):
+    for name in ("drag.linear@elbow", "mass.offset@forearm", "inertia.armature@*"):
         assert list_similar_inertias(example_arm, name, np.array([0.1])) == []
 
 
