@@ -60,28 +60,40 @@ class Reader(HTMLParser):
         return " ".join(" ".join(self.texts).replace("\xa0", " ").split())
 
 
-@pytest.fixture
-def figures():
-    return {name: make_rendered_figure(name) for name in ("overview", "where", "candidates")}
+FIGURES = {name: make_rendered_figure(name) for name in ("overview", "where", "candidates")}
+
+
+def render_page(report, folder=None):
+    """Return the HTML of a page with placeholders for its figures."""
+    return render_report(report, FIGURES, folder)
+
+
+def read_page(report):
+    """Return the visible text of a page."""
+    return Reader(render_page(report)).text
+
+
+def find_rows(text):
+    """Return the HTML of the cells of each row of the tables, without headings."""
+    rows = re.findall(r"<tr[^>]*>(.*?)</tr>", text, re.DOTALL)
+    return [found for row in rows if (found := re.findall(r"<td[^>]*>(.*?)</td>", row))]
 
 
 def cells(text, first):
     """Return the cells of the first table row that begins with this text."""
-    rows = [
-        re.findall(r"<td[^>]*>(.*?)</td>", row)
-        for row in re.findall(r"<tr[^>]*>(.*?)</tr>", text, re.DOTALL)
-    ]
     return next(
-        [unescape(c).replace("\xa0", " ") for c in row] for row in rows if row and row[0] == first
+        [unescape(c).replace("\xa0", " ") for c in row]
+        for row in find_rows(text)
+        if row[0] == first
     )
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
-def test_every_verdict_makes_a_sound_page_that_begins_with_its_headline(verdict, figures):
+def test_every_verdict_makes_a_sound_page_that_begins_with_its_headline(verdict):
     from bench.diagnosis.report.summary_text import format_headline
 
     told = make_report(verdict)
-    html = render_report(told, figures)
+    html = render_page(told)
     reader = Reader(html)
     assert html.startswith("<!DOCTYPE html>\n<html lang=")
     assert reader.headline == format_headline(told)
@@ -95,8 +107,8 @@ def test_every_verdict_makes_a_sound_page_that_begins_with_its_headline(verdict,
     assert not re.search(r"\bnan\b|None|\binf\b", reader.text)
 
 
-def test_it_needs_no_network(figures):
-    html = render_report(make_report(), figures)
+def test_it_needs_no_network():
+    html = render_page(make_report())
     reader = Reader(html)
     assert not set(reader.tags) & {"link", "iframe", "object", "base", "form"}
     assert reader.tags.count("script") == 2
@@ -109,8 +121,8 @@ def test_it_needs_no_network(figures):
     )
 
 
-def test_texts_from_files_and_plugins_are_escaped(figures):
-    html = render_report(evil(), figures)
+def test_texts_from_files_and_plugins_are_escaped():
+    html = render_page(evil())
     reader = Reader(html)
     assert html.count("<script") == html.count("</script") == reader.tags.count("script") == 2
     assert html.count("&lt;script&gt;alert(1)&lt;/script&gt;") > 20
@@ -119,35 +131,30 @@ def test_texts_from_files_and_plugins_are_escaped(figures):
     assert reader.headline.startswith(f"The simulation lacks {EVIL} or {EVIL}")
 
 
-def test_attributes_cannot_be_escaped_from(figures):
+def test_attributes_cannot_be_escaped_from():
     quote = '" onerror="alert(1)'
     told = make_report()
     named = replace(
         told, parameters=tuple(replace(p, name=quote) for p in told.parameters), title=quote
     )
     named = replace(named, channels=tuple(replace(c, name=quote) for c in told.channels))
-    assert not [
-        a for a in Reader(render_report(named, figures)).attributes if a[1].startswith("on")
-    ]
+    assert not [a for a in Reader(render_page(named)).attributes if a[1].startswith("on")]
 
 
-def test_figures_are_embedded_with_alternatives_that_say_what_they_show(figures):
-    html = render_report(make_report(), figures)
+def test_figures_are_embedded_with_alternatives_that_say_what_they_show():
+    html = render_page(make_report())
     pattern = r'src="data:image/svg.xml;base64,([^"]+)" data-file="(\w+)" alt="([^"]+)"'
     found = re.findall(pattern, html)
     data = [(name, b64decode(part)) for part, name, _ in found]
-    names = ("overview", "where", "candidates")
-    assert data == [(name, make_rendered_figure(name).svg) for name in names]
+    assert data == [(name, figure.svg) for name, figure in FIGURES.items()]
     papers = re.findall(r'href="data:application/pdf;base64,([^"]+)"', html)
-    assert [b64decode(paper) for paper in papers] == [
-        make_rendered_figure(name).pdf for name in names
-    ]
-    without = {name: figure._replace(pdf=None, svg=None) for name, figure in figures.items()}
+    assert [b64decode(paper) for paper in papers] == [figure.pdf for figure in FIGURES.values()]
+    without = {name: figure._replace(pdf=None, svg=None) for name, figure in FIGURES.items()}
     html = render_report(make_report(), without)
     assert not re.search("data:(application/pdf|image/svg.xml);", html)
     shown = re.findall(r'src="data:image/png;base64,([^"]+)" data-file="(\w+)"', html)
     assert [(b64decode(data), name) for data, name in shown] == [
-        (make_rendered_figure(name).png, name) for name in names
+        (figure.png, name) for name, figure in FIGURES.items()
     ]
     overview, where, candidates = (alt for _, _, alt in found)
     assert "q and qd" in overview
@@ -156,9 +163,9 @@ def test_figures_are_embedded_with_alternatives_that_say_what_they_show(figures)
     assert "linear drag 812" in candidates
 
 
-def test_numbers_are_those_of_the_report_data(figures):
+def test_numbers_are_those_of_the_report_data():
     told = make_report(causes=[DRAG, TILT])
-    html = render_report(told, figures)
+    html = render_page(told)
     text = Reader(html).text
     assert "Together they close 90 % of the gap (85 to 94 %)" in text
     assert "90 % of the gap closed (85 to 94 %)" in text
@@ -180,9 +187,9 @@ def test_numbers_are_those_of_the_report_data(figures):
     assert "1,412 simulations of system pendulum on engine batch, 2.1 s" in text
 
 
-def test_errors_of_channels_are_recomputed_from_the_runs(figures):
+def test_errors_of_channels_are_recomputed_from_the_runs():
     told = make_report()
-    row = cells(render_report(told, figures), "qd")
+    row = cells(render_page(told), "qd")
     assert row[:3] == ["qd", "0.05 rad/s", "estimated, steps of 0.002"]
     for column, side in ((3, told.fitting), (5, told.held_out)):
         for i, simulated in enumerate((side.before, side.after)):
@@ -192,44 +199,37 @@ def test_errors_of_channels_are_recomputed_from_the_runs(figures):
     assert np.isnan(compute_channel_errors(empty)).all()
 
 
-def test_sets_that_cannot_be_distinguished_come_with_reason_and_experiment(figures):
-    text = Reader(render_report(make_report("ambiguous"), figures)).text
+def test_sets_that_cannot_be_distinguished_come_with_reason_and_experiment():
+    text = read_page(make_report("ambiguous"))
     assert (
         "linear drag (score 812, held-out gain 0.9) and Coulomb friction "
         "(score 807, held-out gain 0.89)" in text
     )
     assert text.count("Release it from 1.5 rad instead of 0.5 rad") >= 2
     assert text.index("What to do next") < text.rindex("Release it from 1.5 rad")
-    drag = cells(render_report(make_report("ambiguous"), figures), "linear drag")
+    drag = cells(render_page(make_report("ambiguous")), "linear drag")
     assert drag[5:7] == ["found, but not distinguishable", "linear drag or Coulomb friction"]
 
 
-def test_after_is_not_shown_where_nothing_was_found(figures):
+def test_after_is_not_shown_where_nothing_was_found():
     for verdict in ("adequate", "unknown", "unidentifiable"):
-        html = render_report(make_report(verdict), figures)
+        html = render_page(make_report(verdict))
         assert "RMS after" not in html
         assert 'class="bar after"' not in html
 
 
-def test_it_says_what_remains(figures):
-    assert (
-        "The noise of qd is estimated from the data, not stated."
-        in Reader(render_report(make_report(), figures)).text
-    )
-    text = Reader(render_report(make_report(lack_of_fit=()), figures)).text
+def test_it_says_what_remains():
+    assert "The noise of qd is estimated from the data, not stated." in read_page(make_report())
+    text = read_page(make_report(lack_of_fit=()))
     assert re.search(r"the residual of the held-out runs is 1 times the noise", text)
 
 
-def test_what_is_open_is_not_called_settled(figures):
-    assert (
-        "Structure that no known cause explains: the residual"
-        in Reader(render_report(make_report("unknown"), figures)).text
+def test_what_is_open_is_not_called_settled():
+    assert "Structure that no known cause explains: the residual" in read_page(
+        make_report("unknown")
     )
-    assert (
-        "Structure that no known cause"
-        in Reader(render_report(make_report("partial", lack_of_fit=()), figures)).text
-    )
-    assert "Nothing significant" in Reader(render_report(make_report("adequate"), figures)).text
+    assert "Structure that no known cause" in read_page(make_report("partial", lack_of_fit=()))
+    assert "Nothing significant" in read_page(make_report("adequate"))
 
 
 def test_gaps_in_what_is_known_do_not_break_the_page():
@@ -272,9 +272,9 @@ def test_many_runs_are_cut_to_the_worst():
     assert f"<td>r{499 - INITIAL_ROWS}<" not in html
 
 
-def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them(figures):
+def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them():
     told = replace(make_report("ambiguous"), path=Path("my logs/it's <b>.csv"))
-    html = render_report(told, figures, Path("out dir"))
+    html = render_page(told, Path("out dir"))
     said = [unescape(text) for text in re.findall(r'<pre class="copied"[^>]*>([^<]*)', html)]
     assert [shlex.split(text) for text in said] == [
         ["simgap", "design", "my logs/it's <b>.csv", "--out", "next.csv"],
@@ -282,21 +282,21 @@ def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them(figure
         ["simgap", "score", "out dir/extended.toml", "OTHER.csv"],
     ]
     # A page without a folder has no extended.toml to refer to.
-    assert "extended.toml" not in render_report(told, figures)
-    unknown = Reader(render_report(make_report("unknown"), figures)).text
+    assert "extended.toml" not in render_page(told)
+    unknown = read_page(make_report("unknown"))
     assert "--plugin my_effect.py" in unknown
-    assert "--check" in Reader(render_report(make_report("unidentifiable"), figures)).text
+    assert "--check" in read_page(make_report("unidentifiable"))
     assert "--thorough" not in unknown, "nothing stands that could be added to"
     partial = make_report("partial")
     assert partial.held_out is not None
-    assert "explain swing.csv --thorough" in Reader(render_report(partial, figures)).text.replace(
+    assert "explain swing.csv --thorough" in read_page(partial).replace(
         str(partial.path), "swing.csv"
     )
     for more in ({"thorough": True}, {"held_out": None}):
-        assert "--thorough" not in Reader(render_report(replace(partial, **more), figures)).text
+        assert "--thorough" not in read_page(replace(partial, **more))
 
 
-def test_what_the_recording_can_fix_comes_before_any_verdict(figures):
+def test_what_the_recording_can_fix_comes_before_any_verdict():
     numbers = (
         ParameterIdentifiability("inertia", True, "kg*m^2", 1e-5, 0.001, 0.01, "identifiable", ()),
         ParameterIdentifiability(
@@ -310,7 +310,7 @@ def test_what_the_recording_can_fix_comes_before_any_verdict(figures):
             "sensor.drift", False, "1", np.inf, 0.0, 1.0, "not identifiable", ()
         ),
     )
-    text = render_report(make_report("named", identifiability=numbers), figures)
+    text = render_page(make_report("named", identifiability=numbers))
     said = Reader(text).text.partition(" Terms ")[2]
     assert (
         "Of 3 causes, each considered alone, this recording can identify 1 well, 1 roughly and"
@@ -326,7 +326,7 @@ def test_what_the_recording_can_fix_comes_before_any_verdict(figures):
 
 
 @pytest.mark.parametrize("verdict", ["named", "ambiguous", "unknown"])
-def test_what_can_be_fixed_does_not_contradict_the_headline(figures, verdict):
+def test_what_can_be_fixed_does_not_contradict_the_headline(verdict):
     """The named cause may be "not identifiable" about the base model; its own fit decides."""
     names = ["drag.linear", "friction.coulomb", "sensor.lag"]
     numbers = [
@@ -334,7 +334,7 @@ def test_what_can_be_fixed_does_not_contradict_the_headline(figures, verdict):
         for n in names
     ]
     told = make_report(verdict, identifiability=tuple(numbers))
-    text = render_report(told, figures)
+    text = render_page(told)
     said = Reader(text).text.partition("Of 3 causes, ")[2].partition("Where the gap is")[0]
     lost = "not visible in these data"
     standings = [cells(text, f"<code>{name}</code>")[1] for name in names]
@@ -348,7 +348,7 @@ def test_what_can_be_fixed_does_not_contradict_the_headline(figures, verdict):
     assert "Found: linear drag (drag.linear)." in said
 
 
-def test_causes_at_places_are_a_matrix_of_effects_by_places(figures):
+def test_causes_at_places_are_a_matrix_of_effects_by_places():
     names = ["friction.coulomb@a", "friction.coulomb@b", "drag.linear@a", "drag.linear@b"]
     words = ["identifiable", "weak", "not identifiable", "identifiable"]
     pairs = zip(names, words, strict=True)
@@ -356,32 +356,22 @@ def test_causes_at_places_are_a_matrix_of_effects_by_places(figures):
         ParameterIdentifiability(n, False, "N", 0.1, 0.0, 1.0, word, ()) for n, word in pairs
     )
     cause = {**DRAG, "effect": "friction.coulomb@b"}
-    text = render_report(make_report("named", identifiability=numbers, causes=[cause]), figures)
-    signs = {
-        row[0]: [re.sub("<[^>]*>", "", cell) for cell in row[1:]]
-        for row in (
-            re.findall(r"<td[^>]*>(.*?)</td>", row)
-            for row in re.findall(r"<tr[^>]*>(.*?)</tr>", text, re.DOTALL)
-        )
-        if row
-    }
+    text = render_page(make_report("named", identifiability=numbers, causes=[cause]))
+    signs = {row[0]: [re.sub("<[^>]*>", "", cell) for cell in row[1:]] for row in find_rows(text)}
     assert signs["Coulomb friction <code>friction.coulomb</code>"] == ["●", "★"]
     assert signs["linear drag <code>drag.linear</code>"] == ["○", "●"]
 
 
-def test_where_nobody_knows_there_is_no_word_of_it(figures):
-    assert (
-        "What the recording identifies"
-        not in Reader(render_report(make_report("named"), figures)).text
-    )
+def test_where_nobody_knows_there_is_no_word_of_it():
+    assert "What the recording identifies" not in read_page(make_report("named"))
 
 
-def test_the_track_of_a_film_is_drawn_next_to_the_curves(figures, tmp_path):
+def test_the_track_of_a_film_is_drawn_next_to_the_curves(tmp_path):
     png = b"\x89PNG\r\n\x1a\n-a track"
-    html = render_report(make_report(track=png), figures)
+    html = render_page(make_report(track=png))
     found = re.search(r'src="data:image/png;base64,([^"]+)" alt="The scene of the film', html)
     assert b64decode(found[1]) == png
-    assert "data:image/png" not in render_report(make_report(), figures)
+    assert "data:image/png" not in render_page(make_report())
 
     def track(extra):
         recording = SimpleNamespace(path=tmp_path / "drop.csv", extra=dict.fromkeys(extra, "px"))
