@@ -9,7 +9,8 @@ from bench.core.plugin_registries import simulators
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.levenberg_marquardt import TrajectoryFit
+from bench.diagnosis.fitting.levenberg_marquardt import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.logs.synthetic_recording import simulate_recording
 from sims.core.simulator import Scenario
@@ -72,9 +73,32 @@ def autoregressive(evaluator, sigma, phi):
     return NoiseModel(sigmas, correlations)
 
 
-def marked(evaluator, stated):
-    """Return a (C,) mask of the channels with specified noise, from one value or C values."""
-    return np.broadcast_to(np.asarray(stated, dtype=bool), (len(evaluator.channels),)).copy()
+def fit_model(
+    evaluator, noise, effects=(), theta=None, states=None, iterations=20, **fitter_options
+):
+    """Fit one model, by default from its nominal parameters and the guessed initial states."""
+    start = FitStart(
+        effects,
+        evaluator.get_nominal_theta() if theta is None else np.array(theta),
+        evaluator.initial_state_guesses if states is None else states,
+    )
+    (fit,) = TrajectoryFitter(evaluator, noise, **fitter_options).fit_models([start], iterations)
+    return fit
+
+
+def make_search(evaluator, noise, rng=0, fixed_parameters=frozenset(), stated=True):
+    """Return a search without fits.
+
+    Args:
+        evaluator: run evaluator.
+        noise: noise model.
+        rng: random generator or its seed.
+        fixed_parameters: indices of the parameters that are not fitted.
+        stated: whether the noise of all channels, or of each of them, is stated.
+    """
+    shape = (len(evaluator.channels),)
+    is_stated = np.broadcast_to(np.asarray(stated, dtype=bool), shape).copy()
+    return EffectSearch(evaluator, noise, fixed_parameters, np.random.default_rng(rng), is_stated)
 
 
 def searched(recorded, sigma, seed=0, stated=True, **options):
@@ -82,13 +106,7 @@ def searched(recorded, sigma, seed=0, stated=True, **options):
     there = evaluator(recorded, **options)
     noise = white(there, sigma)
     base = fit_base_model(there, noise)
-    search = EffectSearch(
-        there,
-        noise,
-        base.insensitive_parameters,
-        np.random.default_rng(seed),
-        marked(there, stated),
-    )
+    search = make_search(there, noise, seed, base.insensitive_parameters, stated)
     return search, search.add_fit(base.fit)
 
 

@@ -16,7 +16,6 @@ from bench.diagnosis.dry_friction_form import (
     has_dry_friction,
     make_soft_kind,
 )
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
@@ -35,6 +34,7 @@ from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from bench.logs.recording_joining import load_joined
 from sims.extended_simulator import read_extended
+from tests.bench.diagnosis.explained_samples import white
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 from tests.bench.diagnosis.verdict_schema import check
 from tests.sims.robot.test_dry_friction import ARM
@@ -72,7 +72,7 @@ def fitted(path, name):
         return RunEvaluator(of, recording, recording.training(), None, candidates=CANDIDATES)
 
     stiff = evaluator(kind)
-    noise = NoiseModel(np.full(2, NOISE), np.zeros(2))
+    noise = white(stiff, NOISE)
     base = fit_base_model(stiff, noise)
     rng = np.random.default_rng(0)
     models = ModelSet(stiff, noise, base.fixed_parameters, rng, np.ones(2, dtype=bool))

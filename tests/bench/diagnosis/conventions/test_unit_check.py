@@ -18,7 +18,6 @@ from bench.diagnosis.conventions.unit_check import (
     find_wrong_units,
 )
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model
@@ -27,6 +26,7 @@ from bench.logs.recording_joining import load_joined
 from bench.logs.synthetic_recording import simulate_recording
 from sims.extended_simulator import FittedValue
 from sims.recording.unit_conversion import compute_unit_scale
+from tests.bench.diagnosis.explained_samples import white
 from tests.command_output import run_command
 from tests.conftest import PLUGINS
 from tests.simulation_arguments import simulation_spec
@@ -80,8 +80,7 @@ def find_unit_error(path=None, recording=None, kind=None):
     kind = kind or simulators.get(recording.system)
     subject = Subject(kind, recording, "batch" if not kind.own_engine else None)
     evaluator = subject.evaluator(recording)
-    sigma = compute_noise_floor(evaluator, recording).sigma
-    noise = NoiseModel(sigma, np.zeros(len(sigma)))
+    noise = white(evaluator, compute_noise_floor(evaluator, recording).sigma)
     return find_wrong_units(subject, evaluator, noise, fit_base_model(evaluator, noise))
 
 

@@ -7,28 +7,17 @@ from bench.diagnosis.experiment_design.discriminating_run import (
     MIN_DISCRIMINATION_SIGMAS,
     propose_discriminating_run,
 )
-from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.levenberg_marquardt import FitStart
-from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.search.effect_search import EffectSearch
 from sims.core.simulator import Scenario
 from sims.systems.pendulum import Pendulum
-from tests.bench.diagnosis.explained_samples import evaluator, marked, recording, white
+from tests.bench.diagnosis.explained_samples import fit_model, recording, searched
 
 
 def fit_each_effect(simulated, sigma, effects, **options):
     """Return a search and one fitted model per effect."""
-    there = evaluator(simulated, candidates=list(effects), **options)
-    noise = white(there, sigma)
-    base = fit_base_model(there, noise)
-    search = EffectSearch(
-        there, noise, base.insensitive_parameters, np.random.default_rng(0), marked(there, True)
-    )
-    models = []
-    for name in effects:
-        start = FitStart((name,), base.fit.theta, base.fit.initial_states)
-        models.append(search.add_fit(TrajectoryFitter(there, noise).fit_models([start], 20)[0]))
-    return search, *models
+    search, base = searched(simulated, sigma, candidates=list(effects), **options)
+    start = base.fit.theta, base.fit.initial_states
+    fits = [fit_model(search.evaluator, search.noise, (name,), *start) for name in effects]
+    return search, *map(search.add_fit, fits)
 
 
 def small_swing(**changes):

@@ -1,16 +1,14 @@
 """Tests that a base parameter beyond its declared range is fitted and not replaced by a cause."""
 
-import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.parameter_bounds import widen_range
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model, fit_wider
 from bench.diagnosis.report.summary_text import format_headline, format_summary
 from bench.diagnosis.search.verdict_rules import BORDERING
 from sims.core.simulator import Parameter
-from tests.bench.diagnosis.explained_samples import evaluator, recording
+from tests.bench.diagnosis.explained_samples import evaluator, recording, white
 from tests.command_output import run_command
 
 HEAVIER = 1.025
@@ -62,7 +60,7 @@ def test_a_parameter_at_a_bound_that_physics_sets_keeps_a_cause_from_being_named
 
 def test_within_its_range_nothing_is_widened():
     there = evaluator(recording(runs=2, seconds=1, rate=50), candidates=[])
-    noise = NoiseModel(np.full(len(there.channels), 0.002), np.zeros(len(there.channels)))
+    noise = white(there, 0.002)
     base = fit_base_model(there, noise)
     declared = [parameter.bounds for parameter in there.parameters]
     assert fit_wider(there, noise, base) is base

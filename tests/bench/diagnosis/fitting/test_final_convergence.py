@@ -5,16 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
-from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.validation.confidence_intervals import compute_intervals
 from sims.systems.slider import Slider
 from tests.bench.diagnosis.explained_samples import (
     autoregressive,
     correlated,
     evaluator,
-    marked,
+    fit_model,
+    make_search,
     recorded,
     white,
 )
@@ -35,13 +34,19 @@ def search_of(there, phi, seed=0):
     """Return a search that assumes white noise, with AR(1) noise of this phi added to the data."""
     rng = np.random.default_rng(seed)
     there.observed[...] += correlated(rng, phi, SIGMA, there.observed.shape)
-    return EffectSearch(there, white(there, SIGMA), frozenset(), rng, marked(there, True))
+    return make_search(there, white(there, SIGMA), rng)
 
 
-def entered(search, theta, iterations, noise=None, exact=False):
-    start = FitStart((NAME,), np.array(theta), search.evaluator.initial_state_guesses)
-    fitter = TrajectoryFitter(search.evaluator, noise or search.noise, is_final_fit=exact)
-    return search.add_fit(fitter.fit_models([start], iterations)[0])
+def entered(search, theta, iterations, exact=False):
+    fit = fit_model(
+        search.evaluator,
+        search.noise,
+        (NAME,),
+        theta,
+        iterations=iterations,
+        is_final_fit=exact,
+    )
+    return search.add_fit(fit)
 
 
 def off(search, model, best):
@@ -58,9 +63,8 @@ def test_it_is_where_generalised_least_squares_ends(there, phi):
     told = search.fit_to_convergence(begun)
     assert told.likelihood.phi[0] == pytest.approx(phi, abs=0.12)
     noise = autoregressive(there, told.likelihood.sigma[0], told.likelihood.phi)
-    start = FitStart((NAME,), np.array([1.1, 0.1]), there.initial_state_guesses)
     best = search._rate_fit(
-        TrajectoryFitter(there, noise, is_final_fit=True).fit_models([start], 60)[0]
+        fit_model(there, noise, (NAME,), [1.1, 0.1], iterations=60, is_final_fit=True)
     )
     assert off(search, told, best) < 0.05
     assert off(search, begun, best) > 0.3

@@ -17,7 +17,14 @@ from bench.diagnosis.search.alternative_causes import refine_best_model
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
-from tests.bench.diagnosis.explained_samples import evaluator, recorded, searched, white, with_runs
+from tests.bench.diagnosis.explained_samples import (
+    evaluator,
+    fit_model,
+    recorded,
+    searched,
+    white,
+    with_runs,
+)
 
 TIMES = np.arange(0, 12.0, 0.02)
 SIGMA = [0.002, 0.01]
@@ -88,8 +95,7 @@ def test_a_fit_of_pieces_begins_that_of_whole_runs_with_their_first_pieces():
     # On whole runs, a fit from this start does not reach the true parameters.
     theta = cut.get_nominal_theta()
     theta[0] = 0.0045
-    begun = FitStart((), theta, cut.initial_state_guesses)
-    found = TrajectoryFitter(cut, white(cut, SIGMA)).fit_models([begun], 12)[0]
+    found = fit_model(cut, white(cut, SIGMA), theta=theta, iterations=12)
     start = join_segment_fits(there, found)
     assert start.initial_states.tolist() == found.initial_states[[0, SEGMENTS_PER_RUN]].tolist()
     without = FitStart((), theta, there.initial_state_guesses)

@@ -8,11 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.fitting.levenberg_marquardt import FitStart
-from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.logs.recording_loading import load_recording
+from tests.bench.diagnosis.explained_samples import fit_model, white
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
 
 NOISE, STEPS, LENGTH, RUNS = 1e-4, 5, 301, 3
@@ -60,8 +58,6 @@ def test_only_the_noise_is_left(tmp_path, seed):
     path = write_log(tmp_path, describe(units, NOISE), ",".join(units), runs, arm=arm)
     recording, kind = load_recording(path)
     there = RunEvaluator(kind, recording, recording.runs, None, [], ())
-    start = FitStart((), there.get_nominal_theta(), there.initial_state_guesses)
-    weights = NoiseModel(np.full(4, NOISE), np.zeros(4))
-    (fit,) = TrajectoryFitter(there, weights).fit_models([start], 30)
+    fit = fit_model(there, white(there, NOISE), iterations=30)
     # The true first states leave the noise. With one damping for all states, 30 to 157 more remain.
     assert fit.cost < np.square(np.array(noise) / NOISE).sum() + 10.0

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.multiple_shooting import forgets_initial_state
@@ -13,6 +12,7 @@ from bench.diagnosis.fitting.trajectory_derivatives import compute_state_jacobia
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.logs.recording_loading import load_recording
 from sims.core.simulator import Scenario
+from tests.bench.diagnosis.explained_samples import white
 from tests.bench.diagnosis.simulated_logs import describe, write_log
 from tests.sims.robot.test_robot_motion import kind_of
 
@@ -54,7 +54,7 @@ def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
     tmp_path, text, expected
 ):
     there = evaluator(tmp_path, text)
-    noise = NoiseModel(np.array([1e-3]), np.zeros(1))
+    noise = white(there, 1e-3)
     by_states = compute_state_jacobian(
         there, there.get_nominal_theta(), there.initial_state_guesses
     )
@@ -89,9 +89,7 @@ def test_a_fit_that_continues_from_a_converged_one_simulates_nothing(tmp_path):
     there = evaluator(tmp_path, ARM.format(damping=0.4, drive=SERVO))
     name, theta = "drag.linear@hinge", there.get_nominal_theta().copy()
     theta[there.coefficient_slices[name]] = 0.05
-    fitter = TrajectoryFitter(
-        there, NoiseModel(np.array([1e-3]), np.zeros(1)), frozenset(), is_final_fit=True
-    )
+    fitter = TrajectoryFitter(there, white(there, 1e-3), is_final_fit=True)
     (fit,) = fitter.fit_models([FitStart((name,), theta, there.initial_state_guesses)], 20)
     assert fit.is_own_jacobian
     np.testing.assert_allclose(fit.theta[there.coefficient_slices[name]], 0.0, atol=1e-3)

@@ -15,6 +15,7 @@ from tests.bench.diagnosis.explained_samples import (
     autoregressive,
     changed,
     evaluator,
+    fit_model,
     recorded,
     recording,
     white,
@@ -33,12 +34,9 @@ def swings():
     return with_runs(made[0], [part.runs[0] for part in made])
 
 
-def fitted(there, theta=None, sigma=1e-3, iterations=30, states=None, effects=(), **options):
-    theta = there.get_nominal_theta() if theta is None else theta
-    start = FitStart(effects, theta, there.initial_state_guesses if states is None else states)
-    return TrajectoryFitter(there, white(there, sigma), **options).fit_models([start], iterations)[
-        0
-    ]
+def fitted(there, theta=None, iterations=30, **options):
+    noise = white(there, 1e-3)
+    return fit_model(there, noise, theta=theta, iterations=iterations, **options)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4])
@@ -221,13 +219,11 @@ def test_least_squares_with_coloured_noise_is_generalised():
             noise[t] = 0.95 * noise[t - 1] + np.sqrt(1 - 0.95**2) * noise[t]
         run = changed(clean.runs[0], q=lambda v, noise=noise: v + 0.02 * noise)
         there = evaluator(replace(clean, runs=(run,)))
-        start = FitStart((), there.get_nominal_theta(), there.initial_state_guesses)
         # The noise is treated once as white and once as AR(1).
-        fitters = [
-            TrajectoryFitter(there, noise)
+        fits = [
+            fit_model(there, noise)
             for noise in (white(there, 0.02), autoregressive(there, 0.02, 0.95))
         ]
-        fits = [fitter.fit_models([start], 20)[0] for fitter in fitters]
         errors.append([fit.theta[0] / TRUE_RATE - 1 for fit in fits])
     ordinary, generalised = np.sqrt(np.square(errors).mean(axis=0))
     assert generalised < 0.85 * ordinary

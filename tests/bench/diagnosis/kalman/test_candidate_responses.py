@@ -1,9 +1,7 @@
 """Tests of the responses of a filter to changes of parameters."""
 
 import numpy as np
-import pytest
 
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.kalman.candidate_responses import (
     COLUMNS_PER_BATCH,
     Columns,
@@ -13,14 +11,7 @@ from bench.diagnosis.kalman.candidate_responses import (
 )
 from bench.diagnosis.kalman.kalman_recursions import LinearRuns, add_noise_states, filter_runs
 from bench.diagnosis.kalman.likelihood_fit import compute_likelihood_step
-from bench.diagnosis.kalman.linearised_filter import FollowedRuns, linearise_run
-
-
-@pytest.fixture(scope="module")
-def followed(example_arm):
-    """Return two runs of the example robot, followed with its model file."""
-    noise = NoiseModel(np.full(2, 0.001), np.zeros(2))
-    return FollowedRuns.follow(example_arm, example_arm.get_nominal_theta(), noise)
+from bench.diagnosis.kalman.linearised_filter import linearise_run
 
 
 def test_parameter_responses_are_differences_of_whole_filters(followed):

@@ -1,17 +1,8 @@
 """Tests of the filter of a model whose parameters differ from those of a known filter."""
 
-import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.kalman.linearised_filter import FollowedRuns
-
-
-@pytest.fixture(scope="module")
-def followed(example_arm):
-    """Return two runs of the example robot, followed with its model file."""
-    noise = NoiseModel(np.full(2, 0.001), np.zeros(2))
-    return FollowedRuns.follow(example_arm, example_arm.get_nominal_theta(), noise)
 
 
 def with_effect(followed, name, coefficient):

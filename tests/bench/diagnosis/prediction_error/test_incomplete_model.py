@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from bench.core.plugin_registries import simulators
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.explain import explain
 from bench.diagnosis.prediction_error.stepwise_selection_by_filters import is_long
@@ -17,6 +16,7 @@ from bench.diagnosis.validation.held_out_runs import HeldOutRuns
 from bench.logs.recording_loading import load_recording
 from bench.logs.segmentation import segment_recording
 from sims.extended_simulator import open_extended
+from tests.bench.diagnosis.explained_samples import white
 from tests.exams.recordings.recording_cases import SHARED, RecordingQuestion
 
 
@@ -48,8 +48,7 @@ def error_in_segments(log, extended_path, seconds):
         places = evaluator.get_coefficient_indices(name)
         for place, coefficient in zip(places, coefficients, strict=True):
             theta[place] = numbers[coefficient.name].value
-    channels = len(evaluator.channels)
-    held_out = HeldOutRuns(evaluator, NoiseModel(np.full(channels, 2.4e-5), np.zeros(channels)))
+    held_out = HeldOutRuns(evaluator, white(evaluator, 2.4e-5))
     (fit,) = held_out.fit_initial_states([theta])
     error = (evaluator.observed - fit.simulated)[held_out.seen]
     return float(np.sqrt(np.mean(error**2)))

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.parameter_bounds import compute_coefficient_bounds
-from bench.diagnosis.fitting.levenberg_marquardt import FitStart
-from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.candidate_directions import (
     END_STOP_DEPTH_SHARES,
     EVENT_TIME_COUNT,
@@ -26,13 +24,11 @@ from bench.diagnosis.search.fit_starts import (
 from bench.diagnosis.search.score_test import ScoreTest
 from sims.core.simulator import Scenario
 from sims.systems.pendulum import Pendulum
-from tests.bench.diagnosis.explained_samples import evaluator, recording, searched, white
+from tests.bench.diagnosis.explained_samples import evaluator, fit_model, recording, searched, white
 
 
 def fitted(there):
-    return TrajectoryFitter(there, white(there, 0.003)).fit_models(
-        [FitStart((), there.get_nominal_theta(), there.initial_state_guesses)], 20
-    )[0]
+    return fit_model(there, white(there, 0.003))
 
 
 @pytest.fixture(scope="module")

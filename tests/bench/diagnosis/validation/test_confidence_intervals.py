@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel, maximise_likelihood
-from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_derivatives import compute_central_jacobian
-from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.validation.confidence_intervals import compute_covariance, compute_intervals
 from bench.diagnosis.validation.held_out_runs import HeldOutRuns
@@ -16,7 +14,8 @@ from tests.bench.diagnosis.explained_samples import (
     autoregressive,
     correlated,
     evaluator,
-    marked,
+    fit_model,
+    make_search,
     recorded,
     recording,
     searched,
@@ -38,10 +37,8 @@ def test_intervals_cover_the_true_parameters(phi):
     theta = np.array([1.3, 0.4])
     for _ in range(60):
         there.observed[...] = clean + correlated(rng, phi, 0.004, clean.shape)
-        fit = TrajectoryFitter(there, noise).fit_models(
-            [FitStart(("drag.linear",), theta, there.initial_state_guesses)], 12
-        )[0]
-        search = EffectSearch(there, noise, frozenset(), rng, marked(there, True))
+        fit = fit_model(there, noise, ("drag.linear",), theta, iterations=12)
+        search = make_search(there, noise, rng)
         found = compute_intervals(search, search.add_fit(fit))
         held.append([found[i][1] <= theta[i] <= found[i][2] for i in range(2)])
     assert 0.88 <= np.mean(held) <= 0.99
@@ -99,11 +96,8 @@ def test_a_coordinate_that_is_not_recorded_hides_no_coefficient_of_the_others():
     )
     there = evaluator(made, candidates=["lift.magnus"])
     noise = white(there, 0.003)
-    theta = np.array([0.5, 0.2, -0.02])
-    fit = TrajectoryFitter(there, noise).fit_models(
-        [FitStart(("lift.magnus",), theta, there.initial_state_guesses)], 8
-    )[0]
-    search = EffectSearch(there, noise, frozenset(), np.random.default_rng(0), marked(there, True))
+    fit = fit_model(there, noise, ("lift.magnus",), [0.5, 0.2, -0.02], iterations=8)
+    search = make_search(there, noise)
     _, low, high = compute_intervals(search, search.add_fit(fit))[1]
     assert low < 0.25 < high
     assert high - low < 0.05
@@ -130,9 +124,9 @@ def test_what_the_data_do_not_bound_has_no_interval():
     made = recorded(Pendulum(), [3.3e-3], [{"q": 1e-4}], np.arange(60) / 60, [0.01, 0.05])
     there = evaluator(made, candidates=["drag.quadratic"])
     noise = white(there, [0.01, 0.05])
-    start = FitStart(("drag.quadratic",), np.array([3.3e-3, 1e-3]), there.initial_state_guesses)
-    search = EffectSearch(there, noise, frozenset(), np.random.default_rng(0), marked(there, True))
-    model = search.add_fit(TrajectoryFitter(there, noise).fit_models([start], 3)[0])
+    search = make_search(there, noise)
+    fit = fit_model(there, noise, ("drag.quadratic",), [3.3e-3, 1e-3], iterations=3)
+    model = search.add_fit(fit)
     assert np.isnan(compute_intervals(search, model)[1][1:]).all()
 
 
@@ -167,16 +161,8 @@ def test_held_out_runs_estimate_initial_states_and_nothing_else():
     assert np.isnan(failed.simulated).all()
 
 
-class SearchWithJumps(EffectSearch):
-    """Search of a robot whose simulated contacts may jump."""
-
-    has_contact_jumps = True
-
-
-@pytest.mark.parametrize(
-    ("search_class", "expected"), [(SearchWithJumps, True), (EffectSearch, False)]
-)
-def test_intervals_by_the_scatter_of_runs_cover_the_mean(search_class, expected):
+@pytest.mark.parametrize("has_contact_jumps", [True, False])
+def test_intervals_by_the_scatter_of_runs_cover_the_mean(monkeypatch, has_contact_jumps):
     """Check 95 % intervals of a mass that scatters between 6 runs by more than noise explains."""
     times, rng, held = np.arange(120) / 60, np.random.default_rng(21), []
     push = np.where(np.sin(5 * times) > 0, 1.0, -1.0)
@@ -185,16 +171,16 @@ def test_intervals_by_the_scatter_of_runs_cover_the_mean(search_class, expected)
     )
     there = evaluator(made, candidates=[])
     runs, states = np.arange(6), there.initial_state_guesses
-    noise = autoregressive(there, 0.004, 0.0)
+    noise = white(there, 0.004)
+    # Simulated contacts of a robot may jump.
+    monkeypatch.setattr(EffectSearch, "has_contact_jumps", has_contact_jumps)
     for _ in range(50):
         masses = rng.normal(1.3, 0.06, size=(6, 1))
         clean = there.simulate(masses, runs, states)
         there.observed[...] = clean + 0.004 * rng.normal(size=clean.shape)
-        fit = TrajectoryFitter(there, noise).fit_models(
-            [FitStart((), np.array([1.3]), states)], 12
-        )[0]
-        search = search_class(there, noise, frozenset(), rng, marked(there, True))
+        fit = fit_model(there, noise, (), [1.3], iterations=12)
+        search = make_search(there, noise, rng)
         _, low, high = compute_intervals(search, search.add_fit(fit))[0]
         held.append(low <= 1.3 <= high)
-    assert (np.mean(held) >= 0.88) == expected
-    assert expected or np.mean(held) < 0.6
+    assert (np.mean(held) >= 0.88) == has_contact_jumps
+    assert has_contact_jumps or np.mean(held) < 0.6

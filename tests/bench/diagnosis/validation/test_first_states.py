@@ -1,17 +1,16 @@
 """Tests that first states of fitted runs are found again after a fit lost them."""
 
-import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.fitting.levenberg_marquardt import FitStart
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.fit_starts import find_first_states
+from tests.bench.diagnosis.explained_samples import white
 
 
 @pytest.fixture(scope="module")
 def fitter(example_arm):
-    return TrajectoryFitter(example_arm, NoiseModel(np.full(2, 1e-3), np.zeros(2)))
+    return TrajectoryFitter(example_arm, white(example_arm, 1e-3))
 
 
 def fit(fitter, states, iterations):
