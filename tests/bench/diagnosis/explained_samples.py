@@ -15,6 +15,8 @@ from bench.diagnosis.search.effect_search import EffectSearch
 from bench.logs.synthetic_recording import simulate_recording
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
+from sims.recording.recording_writer import write_recording
+from sims.systems.slider import Slider
 from tests.simulation_arguments import simulation_spec
 
 
@@ -39,6 +41,27 @@ def recorded(simulator, theta, starts, times, noise=0.0, seed=0, stated=True):
     return Recording(
         Path("made.csv"), simulator.name, "made", simulator.constant_values, kept, tuple(runs)
     )
+
+
+def write_slider_log(path, effect, theta, forces, seed=0):
+    """Write runs of a slider from rest, sampled at 50 Hz, of which the last one is held out.
+
+    Args:
+        path: path of the table.
+        effect: effect that the simulated slider has in addition.
+        theta: its mass and the coefficient of the effect.
+        forces: force of each run (T,), N.
+        seed: seed of the noise of the encoder, 1 mm.
+
+    Returns:
+        The path of the table.
+    """
+    starts = [({}, {"u": force}) for force in forces]
+    slider = Slider(observe=["x"], effects=[effect])
+    made = recorded(slider, theta, starts, np.arange(len(forces[0])) / 50.0, 1e-3, seed)
+    runs = (*made.runs[:-1], replace(made.runs[-1], held_out=True))
+    write_recording(path, replace(made, path=path, runs=runs), Slider)
+    return path
 
 
 def changed(run, **changes):

@@ -10,30 +10,16 @@ from bench.diagnosis.explain import explain
 from bench.diagnosis.identifiability import _IdentifiabilityAssessment, check_identifiability
 from bench.diagnosis.report import identifiability_section
 from bench.diagnosis.report.identifiability_section import format_identifiability
-from sims.core.simulator import InputError, Scenario
-from sims.recording.recording import Recording, Run
-from sims.recording.recording_writer import write_recording
-from sims.systems.slider import Slider
+from sims.core.simulator import InputError
+from tests.bench.diagnosis.explained_samples import write_slider_log
 from tests.command_output import run_command
-
-NOISE = 1e-3
 
 
 def recorded(folder, moved=True, mass=2.0, seed=0, damping=0.0):
     """Write runs of a slider, driven or at rest, with encoder noise; return the path."""
-    rng, times = np.random.default_rng(seed), np.arange(150) / 50.0
-    runs = []
-    for number in range(3):
-        force = 2 * np.sin(3 * times + number) if moved else np.zeros(150)
-        run = Scenario(times, {}, {"u": force})
-        simulator = Slider(observe=["x"], effects=["drag.linear"])
-        x = simulator.simulate(np.array([[mass, damping]]), run)[0, :, 0]
-        seen = x + NOISE * rng.standard_normal(150)
-        runs.append(Run(str(number), times, {"x": seen}, {"u": force}, {}, {}, number == 2))
-    path = folder / "log.csv"
-    about = Recording(path, "slider", "", {}, {"x": NOISE}, tuple(runs))
-    write_recording(path, about, Slider)
-    return path
+    times = np.arange(150) / 50.0
+    forces = [2 * np.sin(3 * times + k) if moved else np.zeros(150) for k in range(3)]
+    return write_slider_log(folder / "log.csv", "drag.linear", [mass, damping], forces, seed)
 
 
 def test_the_width_is_that_of_the_fit(tmp_path):

@@ -13,30 +13,16 @@ from bench.diagnosis.many_logs import (
     format_log_table,
     summarise_causes,
 )
-from sims.core.simulator import Scenario
-from sims.recording.recording import Recording, Run
-from sims.recording.recording_writer import write_recording
-from sims.systems.slider import Slider
+from tests.bench.diagnosis.explained_samples import write_slider_log
 from tests.command_output import run_command
 from tests.local_cluster import cluster
-
-NOISE = 1e-3
 
 
 def log(folder, name, friction, seed):
     """Write runs of a driven slider with dry friction and encoder noise; return the path."""
-    rng, times = np.random.default_rng(seed), np.arange(150) / 50.0
-    simulator = Slider(observe=["x"], effects=["friction.coulomb"])
-    runs = []
-    for number in range(3):
-        force = 3 * np.sin(3 * times + number)
-        seen = simulator.simulate(np.array([[1.4, friction]]), Scenario(times, {}, {"u": force}))
-        x = seen[0, :, 0] + NOISE * rng.standard_normal(150)
-        runs.append(Run(str(number), times, {"x": x}, {"u": force}, {}, {}, number == 2))
-    path = folder / f"{name}.csv"
-    about = Recording(path, "slider", "", {}, {"x": NOISE}, tuple(runs))
-    write_recording(path, about, Slider)
-    return path
+    path, times = folder / f"{name}.csv", np.arange(150) / 50.0
+    forces = [3 * np.sin(3 * times + number) for number in range(3)]
+    return write_slider_log(path, "friction.coulomb", [1.4, friction], forces, seed)
 
 
 @pytest.fixture(scope="module")

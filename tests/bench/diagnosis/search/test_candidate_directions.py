@@ -38,7 +38,21 @@ def swing():
 
 
 def of(found, effect):
+    """Return the columns of the directions of an effect."""
     return [i for i, probe in enumerate(found.candidates) if probe.effect == effect]
+
+
+def probes_of(found, effect):
+    """Return the candidates of an effect."""
+    return [probe for probe in found.candidates if probe.effect == effect]
+
+
+@pytest.fixture(scope="module")
+def pushed_slider():
+    """Return two runs of a slider under a constant force."""
+    return evaluator(
+        recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"])
+    )
 
 
 @pytest.mark.parametrize(
@@ -95,11 +109,8 @@ def test_driven_runs_try_limits_of_the_input():
     made = recording("slider", runs=2, seconds=1, rate=50, inputs=["u=sine:2:1"], noise=["0.003"])
     there = evaluator(made, candidates=["input.gain", "input.saturation", "input.deadband"])
     found = compute_directions(there, fitted(there), there.library)
-    limits = sorted(
-        found.candidates[i].coefficients[0]
-        for i in of(found, "input.saturation")
-        if found.candidates[i].is_single_size
-    )
+    probes = probes_of(found, "input.saturation")
+    limits = sorted(probe.coefficients[0] for probe in probes if probe.is_single_size)
     np.testing.assert_allclose(limits, [0.3, 0.7, 1.2, 1.7, 1.9, 1.98], rtol=2e-3)
     (gain,) = of(found, "input.gain")
     assert found.candidates[gain].can_be_negative
@@ -114,8 +125,8 @@ def test_shapes_are_laid_on_a_grid_and_those_of_one_shape_act_together(swing):
     there, fit = swing
     found = compute_directions(there, fit, ["friction.stribeck", "force.periodic"])
     groups = {}
-    for i in of(found, "friction.stribeck"):
-        groups.setdefault(found.candidates[i].grid_point, []).append(found.candidates[i])
+    for probe in probes_of(found, "friction.stribeck"):
+        groups.setdefault(probe.grid_point, []).append(probe)
     assert len(groups) == SHAPE_GRID_SIZE
     for members in groups.values():
         assert {p.coefficient_index for p in members} == {0, 1}, (
@@ -125,16 +136,14 @@ def test_shapes_are_laid_on_a_grid_and_those_of_one_shape_act_together(swing):
         assert not any(p.can_be_negative for p in members)
     speeds = sorted({members[0].coefficients[2] for members in groups.values()})
     np.testing.assert_allclose([speeds[0], speeds[-1]], [0.02, 2.0], rtol=1e-12)
-    frequencies = {found.candidates[i].grid_point for i in of(found, "force.periodic")}
+    frequencies = {probe.grid_point for probe in probes_of(found, "force.periodic")}
     assert 4 <= len(frequencies) <= MAX_FREQUENCIES
 
 
 def test_what_dies_away_is_tried_at_times_that_the_runs_can_show(swing):
     there, fit = swing
     found = compute_directions(there, fit, ["friction.warming"])
-    times = sorted(
-        {float(found.candidates[i].coefficients[2]) for i in of(found, "friction.warming")}
-    )
+    times = sorted({float(p.coefficients[2]) for p in probes_of(found, "friction.warming")})
     longest = 3.0 * max(
         track.scenario.times[-1] - track.scenario.times[0] for track in there.prepared_runs
     )
@@ -151,18 +160,14 @@ def test_what_modifies_an_effect_is_tried_with_it():
         0.005,
     )
     found = compute_directions(search.evaluator, model.fit, ["wind"])
-    columns = of(found, "wind")
-    winds = {tuple(found.candidates[i].coefficients[1:]) for i in columns}
+    probes = probes_of(found, "wind")
+    winds = [tuple(probe.coefficients[1:]) for probe in probes]
     assert (0.0, 0.0) in winds, "drag in still air"
-    assert len(winds) == 25
-    assert {found.candidates[i].coefficient_index for i in columns} == {0}
-    along = [
-        i
-        for i in columns
-        if found.candidates[i].coefficients[1] == 7.0 and found.candidates[i].coefficients[2] == 0.0
-    ]
+    assert len(set(winds)) == 25
+    assert {probe.coefficient_index for probe in probes} == {0}
+    along = of(found, "wind")[winds.index((7.0, 0.0))]
     x = search.evaluator.channels.index("x")
-    assert found.responses[0, -1, x, along[0]] > 0, "it blows the ball along x"
+    assert found.responses[0, -1, x, along] > 0, "it blows the ball along x"
 
 
 def test_a_diverging_change_counts_as_zero_and_multiplies_without_a_warning(swing, monkeypatch):
@@ -197,12 +202,11 @@ def test_what_happens_once_is_looked_for_on_the_clock_of_the_stamps():
     there = evaluator(replace(made, runs=(first, later)))
     end = float(later.times[-1])
     found = compute_directions(there, fitted(there), ["sensor.slip"])
-    columns = of(found, "sensor.slip")
-    instants = sorted(found.candidates[i].coefficients[1] for i in columns)
+    instants = sorted(probe.coefficients[1] for probe in probes_of(found, "sensor.slip"))
     spaced = np.linspace(0.0, end, EVENT_TIME_COUNT + 2)[1:-1]
     np.testing.assert_allclose(instants, spaced, rtol=1e-12)
     q = there.channels.index("q")
-    for i in columns:
+    for i in of(found, "sensor.slip"):
         instant = found.candidates[i].coefficients[1]
         for r, track in enumerate(there.prepared_runs):
             stamps = track.scenario.times
@@ -219,15 +223,13 @@ def test_what_happens_once_is_looked_for_on_the_clock_of_the_stamps():
     assert bounds[1] == (0.0, end)
 
 
-def test_stops_are_tried_at_both_ends_of_where_it_has_been():
-    there = evaluator(
-        recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"])
-    )
+def test_stops_are_tried_at_both_ends_of_where_it_has_been(pushed_slider):
+    there = pushed_slider
     x = there.observed[..., there.channels.index("x")]
     low, high = float(np.nanmin(x)), float(np.nanmax(x))
     assert there.get_coordinate_range("state.limit") == (low, high)
     found = compute_directions(there, fitted(there), ["state.limit"])
-    tried = [found.candidates[i].coefficients for i in of(found, "state.limit")]
+    tried = [probe.coefficients for probe in probes_of(found, "state.limit")]
     assert {np.sign(c[0]) for c in tried} == {-1.0, 1.0}
     for stiffness, place, loss in tried:
         beyond = (high - place if stiffness > 0 else place - low) / (high - low)
@@ -240,10 +242,8 @@ def test_stops_are_tried_at_both_ends_of_where_it_has_been():
     assert not list(generate_neighbouring_end_stops(there, "spring.linear", np.array([1.0])))
 
 
-def test_a_harder_stop_that_turns_back_at_the_same_place_is_met_later():
-    there = evaluator(
-        recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"])
-    )
+def test_a_harder_stop_that_turns_back_at_the_same_place_is_met_later(pushed_slider):
+    there = pushed_slider
     fit = fitted(there)
     _, high = there.get_coordinate_range("state.limit")
     theta = fit.theta.copy()

@@ -24,8 +24,9 @@ SIGMA = np.array([0.5, 2.0])
 RUNS, SAMPLES, Q, STATES, K = 3, 14, 2, 2, 5
 
 
-def score_candidates(at, residual, directions, seen, noise, surrogate=None):
-    """Score every effect once, with a new test."""
+def score_candidates(at, residual, directions, seen, sigma, surrogate=None):
+    """Score every effect once, with a new test and white noise."""
+    noise = NoiseModel(np.array(sigma), np.zeros(len(sigma)))
     return ScoreTest(at, directions, seen, noise).compute_scores(residual, surrogate)
 
 
@@ -103,8 +104,13 @@ def test_what_the_models_own_freedom_leaves_is_what_least_squares_leave(holes):
     np.testing.assert_allclose(np.concatenate(order, axis=1).T, expected, atol=1e-9)
 
 
-def probes(signed=True):
-    return tuple(CandidateDirection("abcd"[min(i, 3)], 0, 0, np.ones(1), signed) for i in range(K))
+PROBES = tuple(CandidateDirection("abcd"[min(i, 3)], 0, 0, np.ones(1), True) for i in range(K))
+
+
+def score_problem(jacobian, directions, residual, seen, surrogate=None):
+    """Score the four effects of `problem`."""
+    made = DirectionSet(PROBES, directions)
+    return score_candidates(linear_fit(jacobian, Q), residual, made, seen, SIGMA, surrogate)
 
 
 def log_likelihood(residual, seen, phi):
@@ -120,13 +126,7 @@ def log_likelihood(residual, seen, phi):
 
 def test_scores_are_gains_in_log_likelihood_at_the_best_correlation():
     jacobian, directions, residual, seen = problem(2)
-    found = score_candidates(
-        linear_fit(jacobian, Q),
-        residual,
-        DirectionSet(probes(), directions),
-        seen,
-        NoiseModel(SIGMA, np.zeros(2)),
-    )
+    found = score_problem(jacobian, directions, residual, seen)
     nothing, best = -np.inf, dict.fromkeys("abcd", -np.inf)
     for phi in PHI_GRID:
         d, r = dense(jacobian, seen, phi, directions, residual)
@@ -199,13 +199,7 @@ def test_groups_solved_together_are_what_each_is_alone():
 def test_what_the_model_absorbs_is_no_evidence():
     jacobian, directions, residual, seen = problem(5)
     directions[..., 0] = 3.0 * jacobian[..., 0] - jacobian[..., 3]
-    found = score_candidates(
-        linear_fit(jacobian, Q),
-        residual,
-        DirectionSet(probes(), directions),
-        seen,
-        NoiseModel(SIGMA, np.zeros(2)),
-    )
+    found = score_problem(jacobian, directions, residual, seen)
     assert found.score[found.effects.index("a")] == pytest.approx(0.0, abs=1e-6)
     directions[..., 1] = (
         1e9 * jacobian[..., 1] + directions[..., 2]
@@ -253,11 +247,7 @@ def test_p_values_of_clean_residuals_are_uniform(phi):
             j = jacobian[r, :, 0, 1:]
             residual[r, :, 0] -= j @ np.linalg.lstsq(j, residual[r, :, 0], rcond=None)[0]
         like = draw_surrogates(residual, seen, 60, rng)
-        p.append(
-            score_candidates(
-                fit, residual, directions, seen, NoiseModel(np.array([0.1]), np.zeros(1)), like
-            ).p_value
-        )
+        p.append(score_candidates(fit, residual, directions, seen, [0.1], like).p_value)
     p = np.array(p)
     assert (p < 0.01).mean() <= 0.03
     for level in (0.1, 0.3, 0.5):
@@ -270,10 +260,10 @@ def test_a_cause_has_a_small_p_value():
     jacobian, directions, residual, seen = problem(7)
     rng = np.random.default_rng(0)
     like = draw_surrogates(residual - 0.4 * directions[..., 0], seen, 100, rng)
-    noise = NoiseModel(SIGMA, np.zeros(2))
-    fit, made = linear_fit(jacobian, Q), DirectionSet(probes(), directions)
-    clean = score_candidates(fit, residual - 0.4 * directions[..., 0], made, seen, noise, like)
-    caused = score_candidates(fit, residual + 0.6 * directions[..., 0], made, seen, noise, like)
+    clean, caused = (
+        score_problem(jacobian, directions, residual + size * directions[..., 0], seen, like)
+        for size in (-0.4, 0.6)
+    )
     assert clean.p_value > 0.05
     assert caused.p_value < 1e-4
     assert caused.null_scores.shape == (4, 100)
@@ -321,9 +311,7 @@ def test_an_effect_of_many_shapes_keeps_the_best_that_beat_their_neighbours():
         waves[None, :, None],
     )
     fit = linear_fit(1e-9 * rng.standard_normal((1, 400, 1, 2)), 1)
-    (peaks,) = score_candidates(
-        fit, residual, found, seen, NoiseModel(np.array([0.1]), np.zeros(1))
-    ).peaks
+    (peaks,) = score_candidates(fit, residual, found, seen, [0.1]).peaks
     by_place = {group.column_indices[0] // 2: c for group, c in peaks}
     assert {10, 30} <= set(by_place)
     np.testing.assert_allclose(by_place[10], [0.5, 0.0], atol=0.05)

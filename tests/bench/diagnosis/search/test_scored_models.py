@@ -11,11 +11,16 @@ from tests.bench.cli.test_search_progress import Events
 from tests.bench.diagnosis.explained_samples import recording, searched
 
 
+def search_slider(candidates, **options):
+    """Return a search of two runs of a slider, and its base model."""
+    recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, rate=50.0, **options)
+    return searched(recorded, 0.01, candidates=candidates)
+
+
 @pytest.mark.parametrize(("moved", "anew"), [(0.01, False), (1.0, True)])
 def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
     """A fit that differs by `moved` sigmas RMS replaces the base model."""
-    recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
-    search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
+    search, base = search_slider(["friction.coulomb", "spring.linear"], seconds=2.0)
     search.score_missing_effects(base)
     once = search.evaluator.simulation_count
     assert search.score_missing_effects(base) is search.cached_scans[frozenset()].scores
@@ -34,8 +39,7 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
 
 
 def test_scores_at_the_base_model_are_reported_after_a_better_fit_replaced_it():
-    recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
-    search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
+    search, base = search_slider(["friction.coulomb", "spring.linear"], seconds=2.0)
     assert search.base_scores is None
     scores = search.score_missing_effects(base)
     assert search.base_scores is scores
@@ -46,13 +50,10 @@ def test_scores_at_the_base_model_are_reported_after_a_better_fit_replaced_it():
 
 
 def test_scores_of_a_model_do_not_depend_on_earlier_scores():
-    recorded = recording(
-        "slider", effects=["friction.coulomb=0.1"], noise=["0.01"], observe=["x"], runs=2, rate=50.0
-    )
     chances = []
     for first in (True, False):
-        search, base = searched(
-            recorded, 0.01, candidates=["friction.coulomb", "spring.linear", "drag.linear"]
+        search, base = search_slider(
+            ["friction.coulomb", "spring.linear", "drag.linear"], effects=["friction.coulomb=0.1"]
         )
         start = replace(base.fit.make_start(), effects=("drag.linear",))
         search.refit_models([start])
@@ -72,11 +73,8 @@ def test_scores_of_a_model_do_not_depend_on_earlier_scores():
 
 
 def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkeypatch):
-    recorded = recording(
-        "slider", effects=["friction.coulomb=0.1"], noise=["0.01"], observe=["x"], runs=2, rate=50.0
-    )
     names = ["drag.linear", "spring.linear"]
-    search, base = searched(recorded, 0.01, candidates=["friction.coulomb", *names])
+    search, base = search_slider(["friction.coulomb", *names], effects=["friction.coulomb=0.1"])
     search.refit_models([replace(base.fit.make_start(), effects=(name,)) for name in names])
     first, second = (search.models[frozenset([name])] for name in names)
     search.score_missing_effects(base)
@@ -101,9 +99,8 @@ def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkey
 
 
 def test_a_survey_of_several_models_reports_each_of_them():
-    recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
     candidates = ["friction.coulomb", "spring.linear", "drag.linear"]
-    search, _ = searched(recorded, 0.01, candidates=candidates)
+    search, _ = search_slider(candidates, seconds=2.0)
     names = [("friction.coulomb",), ("spring.linear",)]
     search.refit_models([replace(search.base_model.fit.make_start(), effects=one) for one in names])
     heard = Events()
