@@ -13,6 +13,7 @@ from bench.diagnosis.report.report_data import (
     ParameterChange,
     ResidualProfile,
 )
+from bench.diagnosis.report.summary_text import format_gain_and_caveats, format_summary
 from bench.diagnosis.verdict import Verdict
 
 EVIL = "<script>alert(1)</script>"
@@ -195,6 +196,16 @@ def make_report(verdict="named", **changes):
         ),
     )
     return replace(made, **fields)
+
+
+def summary_text(report):
+    """Return the summary for a terminal on one line."""
+    return " ".join(" ".join(format_summary(report)).split())
+
+
+def gain_text(report):
+    """Return the sentences after the headline, of which the first one is the gain."""
+    return " ".join(format_gain_and_caveats(report))
 
 
 def evil():

@@ -3,7 +3,6 @@
 Plain MuJoCo makes the motion, from a model file with `frictionloss` at the elbow.
 """
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -139,8 +138,7 @@ def test_explain_says_the_form_and_its_files_reproduce_it(tmp_path, monkeypatch,
     assert cause.effect == "friction.coulomb@elbow"
     assert cause.coefficients["coefficient"].value == pytest.approx(PLANTED, rel=0.03)
     paths = {one.name: one for one in found.write(tmp_path / "out")}
-    check(paths["verdict.json"].read_text())
-    (stated,) = json.loads(paths["verdict.json"].read_text())["causes"]
+    (stated,) = check(paths["verdict.json"].read_text())["causes"]
     assert stated.get("form") == cause.form == ("soft" if form == "soft" else None)
     words = "in MuJoCo's soft form (solreffriction 0.02 1)"
     assert (words in found.story.verdict.causes[0].says) == (form == "soft")

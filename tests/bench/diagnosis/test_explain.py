@@ -37,6 +37,12 @@ def explained(path, **options):
     return found
 
 
+def check_refused(path, message):
+    """Check that explain refuses a recording with a message."""
+    with pytest.raises(InputError, match=message):
+        explain(path)
+
+
 def names(found):
     return [cause.effect for cause in found.causes]
 
@@ -61,15 +67,13 @@ def swings(times=TIMES, count=3, effects=None, seed=0):
 def test_too_short_a_recording_is_one_line(tmp_path):
     rng = np.random.default_rng(0)
     short = table(tmp_path, [swing(TIMES[:6], rng=rng)])
-    with pytest.raises(
-        InputError,
-        match=r"odd.csv: too short: 8 samples for fitting, expected at least 10 for 3 par",
-    ):
-        explain(short)
-    with pytest.raises(
-        InputError, match=r"odd.toml: the only run is too short to hold its last third out: 3 rows"
-    ):
-        explain(table(tmp_path, [swing(TIMES[:3], rng=rng)]))
+    check_refused(
+        short, r"odd.csv: too short: 8 samples for fitting, expected at least 10 for 3 par"
+    )
+    check_refused(
+        table(tmp_path, [swing(TIMES[:3], rng=rng)]),
+        r"odd.toml: the only run is too short to hold its last third out: 3 rows",
+    )
 
 
 def test_many_runs_of_few_samples_have_a_verdict(tmp_path):
@@ -102,15 +106,15 @@ def test_a_pendulum_that_is_held_aside_is_not_explained_by_one_name(tmp_path):
 
 def test_channels_without_samples_are_one_line(tmp_path):
     for columns in ((np.nan * TIMES, np.nan * TIMES), (0.1 * np.sin(8 * TIMES), np.nan * TIMES)):
-        with pytest.raises(InputError, match=r"column qd? has no sample; leave the channel out"):
-            explain(table(tmp_path, [(TIMES, *columns)] * 3))
+        path = table(tmp_path, [(TIMES, *columns)] * 3)
+        check_refused(path, r"column qd? has no sample; leave the channel out")
 
 
 def test_a_run_without_samples_is_one_line_and_one_without_a_channel_is_used(tmp_path):
     runs = swings(count=3)
     empty = [runs[0], (TIMES, np.nan * TIMES, np.nan * TIMES), runs[2]]
-    with pytest.raises(InputError, match="run '2' has no sample of any channel"):
-        explain(table(tmp_path, empty, noise=NOISE))
+    path = table(tmp_path, empty, noise=NOISE)
+    check_refused(path, "run '2' has no sample of any channel")
     found = explained(
         table(tmp_path, [runs[0], (*runs[1][:2], np.nan * TIMES), runs[2]], noise=NOISE)
     )
@@ -138,11 +142,10 @@ def test_a_gain_of_a_thousand_is_not_named_wrongly(tmp_path):
 
 def test_values_that_cannot_be_are_one_line(tmp_path):
     runs = [(times, 1e12 * q, qd) for times, q, qd in swings()]
-    with pytest.raises(
-        InputError,
-        match=r"column q: expected values of about 1 rad, found 1.2e\+12; is the unit right",
-    ):
-        explain(table(tmp_path, runs))
+    check_refused(
+        table(tmp_path, runs),
+        r"column q: expected values of about 1 rad, found 1.2e\+12; is the unit right",
+    )
 
 
 def test_what_does_not_fit_the_system_at_all_is_unknown(tmp_path):
@@ -211,10 +214,8 @@ def test_other_engines_explain_too(tmp_path):
 
 def test_what_takes_no_effects_is_refused(tmp_path, spring):
     write(simulation_spec("spring", runs=2, seconds=1), tmp_path / "spring.csv")
-    with pytest.raises(
-        InputError, match="simulator spring takes no effects, so nothing can be missing from it"
-    ):
-        explain(tmp_path / "spring.csv")
+    message = "simulator spring takes no effects, so nothing can be missing from it"
+    check_refused(tmp_path / "spring.csv", message)
 
 
 @pytest.mark.slow
@@ -283,11 +284,8 @@ def test_an_extended_simulator_is_scored_and_explained_as_its_system(tmp_path):
     ).recording
     columns = [(run.times, run.channels["q"], run.channels["qd"]) for run in made.runs]
     path = table(tmp_path, columns, system="pendulum_extended", noise=NOISE)
-    with pytest.raises(
-        InputError,
-        match="pendulum_extended is extended already; name the system it extends, pendulum",
-    ):
-        explain(path)
+    message = "pendulum_extended is extended already; name the system it extends, pendulum"
+    check_refused(path, message)
     again = explained(path, system="pendulum")
     assert names(again) == ["drag.linear"]
     drag = again.causes[0].coefficients["coefficient"]

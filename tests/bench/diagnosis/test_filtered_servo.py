@@ -3,9 +3,6 @@
 Plain MuJoCo makes the motion, from a model file with another damping at the elbow.
 """
 
-import os
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
@@ -15,6 +12,7 @@ from bench.diagnosis.score_extended import score_model
 from bench.logs.filter_settling import leave_out_settling
 from bench.logs.recording_joining import load_joined
 from tests.bench.diagnosis.simulated_logs import describe, follow, write_log
+from tests.exams.recordings.recording_cases import SHARED
 
 NOISE = 5e-4
 ARM = """
@@ -43,7 +41,6 @@ SERVOS = (
 STATED, PLANTED = 0.1, 0.9
 UNITS = dict.fromkeys(("u.s1", "u.s2", "q.shoulder", "q.elbow"), "rad")
 LOG = describe(UNITS, NOISE, "[runs.3]\nheld_out = true\n")
-SHARED = Path(os.environ.get("SIMGAP_SHARED", Path(__file__).parents[4] / "shared"))
 CASE = SHARED / "cases" / "filtered_servo" / "log.csv"
 
 

@@ -3,18 +3,15 @@
 Plain MuJoCo makes the motion; its servo has no gains while it is off.
 """
 
-import json
-import os
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 
 from bench.diagnosis import explain as explaining
-from bench.diagnosis.report.summary_text import format_summary
+from tests.bench.diagnosis.sample_report_data import summary_text
 from tests.bench.diagnosis.simulated_logs import follow, write_log
 from tests.bench.diagnosis.verdict_schema import check
+from tests.exams.recordings.recording_cases import SHARED
 
 NOISE = 1e-3
 ROD = """
@@ -35,7 +32,6 @@ LOG = (
 )
 EXTRA = '[extra.enabled]\nunit = "1"\n'
 SWITCH = '[actuators.drive]\nenable = "enabled"\n'
-SHARED = Path(os.environ.get("SIMGAP_SHARED", Path(__file__).parents[4] / "shared"))
 CASE = SHARED / "cases" / "torque_switched_off" / "log.csv"
 
 
@@ -80,11 +76,10 @@ def test_the_planted_damping_is_found(tmp_path, given):
     }
     assert sum(notes[given] in line for line in lines) == 1
     # The note follows the headline and precedes the first coefficient.
-    told = " ".join(" ".join(format_summary(found.story)).split()).lower()
+    told = summary_text(found.story).lower()
     assert told.index(notes[given].lower()) < told.index("coefficient")
-    paths = {one.name: one for one in found.write(tmp_path / "out")}
-    check(paths["verdict.json"].read_text())
-    (note,) = json.loads(paths["verdict.json"].read_text())["recording_notes"]
+    found.write(tmp_path / "out")
+    (note,) = check((tmp_path / "out" / "verdict.json").read_text())["recording_notes"]
     assert notes[given] in note
 
 

@@ -25,7 +25,7 @@ from bench.diagnosis.search.verdict_rules import verdict_of_numbers
 from sims.core.simulator import Parameter
 from sims.extended_simulator import FittedValue
 from tests.bench.diagnosis.explained_samples import evaluator, recording
-from tests.bench.diagnosis.sample_report_data import DRAG, make_report
+from tests.bench.diagnosis.sample_report_data import DRAG, make_report, summary_text
 from tests.bench.diagnosis.simulated_logs import write_log
 from tests.command_output import run_command
 from tests.conftest import PLUGINS
@@ -203,7 +203,7 @@ def test_a_partial_verdict_for_a_bound_says_which():
     assert format_headline(report) == (
         "The simulation lacks a sensor lag, but the fit ends at the upper bound of its range, 4 s."
     )
-    said = " ".join(" ".join(format_summary(report)).split())
+    said = summary_text(report)
     assert "sensor.lag, coefficient: 4 s is the upper bound of its range" in said
     assert "record longer runs" in said
     assert "coefficient 4 s (upper bound of its range)" in said

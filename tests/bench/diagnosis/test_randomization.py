@@ -93,6 +93,11 @@ def explanation_of(kind, effects, free=None, verdict="named", alternatives=(), t
     return Explanation(found, replace(make_report(), verdict=found), extended)
 
 
+def files_of(explanation):
+    """Return the text of the files of ranges by name."""
+    return build_range_files(explanation.ranges, explanation.extended)
+
+
 def by_name(explanation):
     """Return the ranges by cause and coefficient."""
     return {(r.cause, r.coefficient): r for r in explanation.ranges.ranges}
@@ -183,7 +188,7 @@ def test_compensated_gravity_has_no_range(arm):
 
 def test_numbers_without_a_field_are_a_table_without_code(arm):
     found = explanation_of(arm, {"input.delay@m_elbow": one(0.02, 0.002)})
-    assert list(build_range_files(found.ranges, found.extended)) == ["ranges.toml", "ranges.csv"]
+    assert list(files_of(found)) == ["ranges.toml", "ranges.csv"]
     (line,) = found.ranges.left_out
     assert line.startswith("no code for Isaac Lab and MuJoCo Playground is written")
 
@@ -191,7 +196,7 @@ def test_numbers_without_a_field_are_a_table_without_code(arm):
 @pytest.mark.parametrize("effect", [name for name in EFFECTS if name != "input.delay@m_elbow"])
 def test_the_code_of_each_effect_alone_runs(arm, effect):
     found = explanation_of(arm, {effect: EFFECTS[effect]})
-    files = build_range_files(found.ranges, found.extended)
+    files = files_of(found)
     model, axes = randomized(files["ranges_mujoco_playground.py"], arm.robot.compiled)
     assert model._values
     assert set(axes._values) == set(model._values)
@@ -297,7 +302,7 @@ def randomized(code, model):
 
 
 def test_the_function_for_mujoco_playground_sets_the_fields(arm, everything):
-    code = build_range_files(everything.ranges, everything.extended)["ranges_mujoco_playground.py"]
+    code = files_of(everything)["ranges_mujoco_playground.py"]
     model, axes = randomized(code, arm.robot.compiled)
     fields = model._values
     assert dict.fromkeys(fields, 0) == axes._values
@@ -331,7 +336,7 @@ def test_the_function_for_mujoco_playground_sets_the_fields(arm, everything):
 
 
 def test_another_model_is_refused_by_the_function(everything):
-    code = build_range_files(everything.ranges, everything.extended)["ranges_mujoco_playground.py"]
+    code = files_of(everything)["ranges_mujoco_playground.py"]
     other = mujoco.MjModel.from_xml_string(ARM.replace("elbow", "knee"))
     with pytest.raises(ValueError, match="the model has no mjOBJ_JOINT 'elbow'"):
         randomized(code, other)
@@ -359,7 +364,7 @@ def events(code):
 
 
 def test_the_event_terms_for_isaac_lab_have_the_ranges(everything):
-    code = build_range_files(everything.ranges, everything.extended)["ranges_isaac_lab.py"]
+    code = files_of(everything)["ranges_isaac_lab.py"]
     found = events(code)
     assert {term["mode"] for term in found.values()} == {"startup"}
     rubs = found["dof_frictionloss_elbow"]
@@ -407,7 +412,7 @@ def test_names_from_files_do_not_become_code(tmp_path):
     kind = make_robot_simulator(path)
     name = kind.robot.joints[1].name
     found = explanation_of(kind, {f"friction.coulomb@{name}": one(0.1, 0.01)}, title=EVIL)
-    files = build_range_files(found.ranges, found.extended)
+    files = files_of(found)
     (term,) = events(files["ranges_isaac_lab.py"]).values()
     (pattern,) = term["params"]["asset_cfg"][1]["joint_names"]
     assert re.fullmatch(pattern, name)

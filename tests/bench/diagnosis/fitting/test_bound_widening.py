@@ -5,10 +5,11 @@ import pytest
 from bench.diagnosis.evaluation.parameter_bounds import widen_range
 from bench.diagnosis.explain import explain
 from bench.diagnosis.fitting.base_fit import fit_base_model, fit_wider
-from bench.diagnosis.report.summary_text import format_headline, format_summary
+from bench.diagnosis.report.summary_text import format_headline
 from bench.diagnosis.search.verdict_rules import BORDERING
 from sims.core.simulator import Parameter
 from tests.bench.diagnosis.explained_samples import evaluator, recording, white
+from tests.bench.diagnosis.sample_report_data import summary_text
 from tests.command_output import run_command
 
 HEAVIER = 1.025
@@ -38,7 +39,7 @@ def test_an_inertia_beyond_its_range_is_fitted_and_no_cause_is_named(heavy):
     assert (answer.verdict, answer.causes) == ("adequate", ())
     assert inertia.value == pytest.approx(0.01 * HEAVIER, rel=2e-3)
     assert inertia.low < inertia.value < inertia.high
-    said = " ".join(" ".join(format_summary(found.story)).split())
+    said = summary_text(found.story)
     assert "lies outside its usual range, 0.001 to 0.01 kg*m^2" in said
 
 

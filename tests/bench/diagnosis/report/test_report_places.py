@@ -21,7 +21,6 @@ from bench.diagnosis.report.cause_and_value_text import (
 from bench.diagnosis.report.diagnosed_places import list_place_marks
 from bench.diagnosis.report.report_data import ChannelInfo
 from bench.diagnosis.report.summary_text import (
-    format_gain_and_caveats,
     format_headline,
     format_summary,
 )
@@ -35,7 +34,7 @@ from tests.bench.diagnosis.robot_report_data import (
     make_robot_report,
     number,
 )
-from tests.bench.diagnosis.sample_report_data import make_report
+from tests.bench.diagnosis.sample_report_data import gain_text, make_report, summary_text
 from tests.bench.figures.figure_robots import ARM6
 
 
@@ -154,7 +153,7 @@ def test_a_further_effect_is_missing_although_a_number_is_wrong():
     )
     assert text.endswith("and the simulation lacks something else that no known cause explains.")
     both = format_headline(make_robot_report("partial", [COULOMB, HEAVY]))
-    report = " ".join(format_gain_and_caveats(make_robot_report("partial", [COULOMB, HEAVY])))
+    report = gain_text(make_robot_report("partial", [COULOMB, HEAVY]))
     assert "opposes motion; the mass of body elbow_link is 12 % larger than" in report
     assert both.endswith("elbow_link, and lacks something else that no known cause explains.")
 
@@ -197,7 +196,7 @@ def test_another_integrator_is_not_called_inaccurate():
 def test_unknown_and_adequate_count_causes_and_not_their_places():
     unknown = format_headline(make_robot_report("unknown", causes=()))
     assert "none of the 16 known causes explains it at any place" in unknown
-    clean = " ".join(format_gain_and_caveats(make_robot_report("adequate", causes=())))
+    clean = gain_text(make_robot_report("adequate", causes=()))
     assert "16 possible causes were tested at every place and none improves" in clean
 
 
@@ -218,9 +217,9 @@ def test_causes_without_places_are_listed_as_ever():
 
 
 def test_the_account_says_numbers_at_their_places():
-    text = " ".join(" ".join(format_summary(make_robot_report(causes=[EVERYWHERE]))).split())
+    text = summary_text(make_robot_report(causes=[EVERYWHERE]))
     assert "0.300 (0.280 to 0.320) N·m at shoulder_pan, " in text
-    text = " ".join(" ".join(format_summary(make_robot_report("ambiguous", [WRISTS]))).split())
+    text = summary_text(make_robot_report("ambiguous", [WRISTS]))
     assert "Each closes 90 % of the gap" in text
     assert (
         "Coulomb friction at joint wrist_2 or wrist_3 would explain the data equally well" in text
@@ -236,7 +235,7 @@ def test_what_an_effect_does_is_said_without_its_place():
 
 def test_of_many_channels_the_worst_of_each_kind_is_said():
     report = make_robot_report("adequate", causes=())
-    assert " ".join(format_gain_and_caveats(report)).count(" of its noise") == 2
+    assert gain_text(report).count(" of its noise") == 2
     few = replace(
         report,
         channels=(
@@ -244,10 +243,8 @@ def test_of_many_channels_the_worst_of_each_kind_is_said():
             *(ChannelInfo(f"x{i}", "m", 1.0, True, 0.0) for i in range(10)),
         ),
     )
-    assert " ".join(format_gain_and_caveats(few)).count("in x") == 10
-    assert "Correcting it closes" in " ".join(
-        format_gain_and_caveats(make_robot_report(causes=[HEAVY]))
-    )
+    assert gain_text(few).count("in x") == 10
+    assert "Correcting it closes" in gain_text(make_robot_report(causes=[HEAVY]))
 
 
 def test_marks_are_the_places_that_the_verdict_names():

@@ -18,7 +18,6 @@ from bench.diagnosis.report.cause_and_value_text import (
 from bench.diagnosis.report.detectable_gap import compute_detectable_gap
 from bench.diagnosis.report.report_data import ChannelInfo, DataSplit
 from bench.diagnosis.report.summary_text import (
-    format_gain_and_caveats,
     format_headline,
     format_summary,
     get_held_out_unit,
@@ -30,19 +29,12 @@ from tests.bench.diagnosis.sample_report_data import (
     NEXT,
     TILT,
     evil,
+    gain_text,
     make_report,
+    summary_text,
 )
 
 VERDICTS = ("adequate", "named", "ambiguous", "partial", "unknown", "unidentifiable")
-
-
-def text(report):
-    return " ".join(" ".join(format_summary(report)).split())
-
-
-def format_gain_text(report):
-    """Return the sentences after the headline, of which the first one is the gain."""
-    return " ".join(format_gain_and_caveats(report))
 
 
 @pytest.mark.parametrize(
@@ -71,19 +63,19 @@ def format_gain_text(report):
 def test_each_verdict_has_its_headline(verdict, headline):
     report = make_report(verdict)
     assert format_headline(report) == headline
-    assert headline in text(report)
+    assert headline in summary_text(report)
 
 
 def test_only_found_causes_are_said_to_be_lacking():
     for verdict in ("adequate", "unknown", "unidentifiable"):
-        assert "lacks linear drag" not in text(make_report(verdict))
+        assert "lacks linear drag" not in summary_text(make_report(verdict))
 
 
 def test_several_causes_are_named_together():
     report = make_report(causes=[DRAG, TILT])
     assert format_headline(report) == "The simulation lacks linear drag and a tilt of gravity."
-    assert "Together they close 90 % of the gap" in format_gain_text(report)
-    assert "gravity has a horizontal component" in text(report)
+    assert "Together they close 90 % of the gap" in gain_text(report)
+    assert "gravity has a horizontal component" in summary_text(report)
 
 
 def test_an_ambiguous_cause_with_a_certain_one():
@@ -102,7 +94,7 @@ def test_a_partial_verdict_keeps_what_cannot_be_distinguished():
 
 
 def test_the_gain_of_a_partial_verdict_is_that_of_the_named_cause():
-    assert format_gain_text(make_report("partial")).startswith("Linear drag closes 90 % of the gap")
+    assert gain_text(make_report("partial")).startswith("Linear drag closes 90 % of the gap")
 
 
 def test_unidentifiable_names_the_unidentified_parameters():
@@ -112,7 +104,7 @@ def test_unidentifiable_names_the_unidentified_parameters():
 
 
 def test_the_gain_is_reported_with_its_interval_and_units():
-    said = format_gain_text(make_report())
+    said = gain_text(make_report())
     assert "closes 90 % of the gap (85 to 94 %)" in said
     assert "0.37 rad before and 0.045 rad after" in said
     assert said.endswith("the sensor noise alone would give 0.01 rad.")
@@ -122,15 +114,15 @@ def test_without_held_out_runs_the_gain_is_not_claimed():
     report = make_report(heldout=None, held_out=None)
     side = report.fitting
     before = np.sqrt(np.nanmean(((side.observed - side.before) / [0.01, 0.05]) ** 2))
-    assert "No run is held out" in format_gain_text(report)
-    assert f"{before:.3g} times the noise before" in format_gain_text(report)
-    assert "of the gap" not in format_gain_text(report)
+    assert "No run is held out" in gain_text(report)
+    assert f"{before:.3g} times the noise before" in gain_text(report)
+    assert "of the gap" not in gain_text(report)
 
 
 def test_nothing_is_called_closed_where_no_share_is_known():
     found = {**HELD_OUT, "gap_closed": None, "low": None, "high": None}
-    assert "of the gap" not in format_gain_text(make_report(heldout=found))
-    assert "0.045 rad after" in format_gain_text(make_report(heldout=found))
+    assert "of the gap" not in gain_text(make_report(heldout=found))
+    assert "0.045 rad after" in gain_text(make_report(heldout=found))
 
 
 def test_a_weak_cause_under_unknown_is_not_sold_as_the_answer():
@@ -138,7 +130,7 @@ def test_a_weak_cause_under_unknown_is_not_sold_as_the_answer():
         "unknown", causes=[DRAG], heldout={**HELD_OUT, "gap_closed": 0.3, "low": 0.1, "high": 0.5}
     )
     assert format_headline(report).startswith("Something is missing")
-    assert format_gain_text(report).startswith(
+    assert gain_text(report).startswith(
         "The best of them, linear drag, closes only 30 % of the gap (10 to 50 %)"
     )
 
@@ -147,14 +139,14 @@ def test_a_score_that_simulations_do_not_confirm_is_not_called_insignificant():
     report = make_report("adequate")
     candidates = [replace(candidate, p_value=1e-9) for candidate in report.verdict.candidates]
     report = replace(report, verdict=replace(report.verdict, candidates=candidates))
-    said = " ".join(format_gain_and_caveats(report))
+    said = gain_text(report)
     assert "tested and none improves the simulation significantly; the most promising is" in said
     assert "p <" not in said
     assert "p = " not in said
 
 
 def test_adequate_says_what_was_looked_for_and_what_could_hide():
-    said = " ".join(format_gain_and_caveats(make_report("adequate")))
+    said = gain_text(make_report("adequate"))
     assert "6 possible causes were tested" in said
     assert "p = 0.4" in said
     assert re.search(
@@ -188,9 +180,11 @@ def test_a_gap_that_hides_is_smaller_with_more_samples_and_larger_than_a_true_on
 
 
 def test_ambiguous_proposes_the_experiment_and_says_so_if_there_is_none():
-    assert "To distinguish them: Release it from 1.5 rad" in text(make_report("ambiguous"))
-    assert "no experiment is proposed" in text(make_report("ambiguous", next_experiment=None))
-    assert "Next experiment: Release it" in text(
+    assert "To distinguish them: Release it from 1.5 rad" in summary_text(make_report("ambiguous"))
+    assert "no experiment is proposed" in summary_text(
+        make_report("ambiguous", next_experiment=None)
+    )
+    assert "Next experiment: Release it" in summary_text(
         make_report("unidentifiable", next_experiment=NEXT)
     )
 
@@ -203,7 +197,7 @@ def test_the_unit_of_the_gain_is_that_of_the_channels_whose_noise_is_its_floor()
 
 
 def test_parameters_tell_what_they_had_absorbed():
-    said = text(make_report())
+    said = summary_text(make_report())
     assert (
         "inertia 0.00333 (0.00325 to 0.00341) kg·m² before, "
         "0.00351 (0.00345 to 0.00357) kg·m² after (+5.4 %)" in said
@@ -213,12 +207,12 @@ def test_parameters_tell_what_they_had_absorbed():
 
 
 def test_the_largest_gap_is_located():
-    said = text(make_report())
+    said = summary_text(make_report())
     assert (
         "run 4 (13 before, 1.1 after); channel qd (11 before, 1.1 after); "
         "phase last third (16 before, 1.2 after)" in said
     )
-    assert "gap is largest" not in text(make_report("adequate"))
+    assert "gap is largest" not in summary_text(make_report("adequate"))
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -226,8 +220,8 @@ def test_the_account_is_short_and_fits_a_terminal(verdict):
     lines = format_summary(make_report(verdict))
     assert len(lines) <= 32
     assert max(len(line) for line in lines) <= 100
-    assert "nan" not in text(make_report(verdict)).lower()
-    assert "None" not in text(make_report(verdict))
+    assert "nan" not in summary_text(make_report(verdict)).lower()
+    assert "None" not in summary_text(make_report(verdict))
 
 
 def test_a_terminal_obeys_nothing_in_the_data():
@@ -317,21 +311,21 @@ CUT = {"by": "budget", "during": "refit of drag.linear and 3 more", "not_asked":
 
 
 def test_an_early_end_is_reported_before_anything_else():
-    report = text(make_report("unknown", cut=CUT, causes=[DRAG]))
+    report = summary_text(make_report("unknown", cut=CUT, causes=[DRAG]))
     assert "The search stopped before it identified what the simulation lacks; best" in report
     assert "by its time budget; last step: refit of drag.linear and 3 more. Not" in report
     assert "none of the 6 known causes" not in report, "they were not all asked"
-    report = text(make_report("unknown", cut={**CUT, "by": "interrupt"}))
+    report = summary_text(make_report("unknown", cut={**CUT, "by": "interrupt"}))
     assert (
         "before it identified what the simulation lacks. The search was stopped by an in" in report
     )
-    report = text(make_report("partial", cut={**CUT, "not_asked": ["structure"]}))
+    report = summary_text(make_report("partial", cut={**CUT, "not_asked": ["structure"]}))
     assert "lacks linear drag; the search stopped before testing for further causes." in report
     assert "something else that no known cause explains" not in report
 
 
 def test_held_out_runs_that_were_not_asked_are_not_said_to_be_missing():
     cut = {**CUT, "not_asked": ["held_out", "structure"]}
-    report = text(make_report("unknown", cut=cut, heldout=None))
+    report = summary_text(make_report("unknown", cut=cut, heldout=None))
     assert "The gain was not measured on held-out runs" in report
     assert "No run is held out" not in report

@@ -49,6 +49,14 @@ def evidence(
     return found
 
 
+def significant_evidence(monkeypatch, search):
+    """Return the evidence for the best model if all effects are plausible and significant."""
+    monkeypatch.setattr(AlternativeFinder, "_compute_range_excess", lambda self, effect: 1.0)
+    monkeypatch.setattr(AlternativeFinder, "_compute_p_value", lambda self, rest, effect, gain: 0.0)
+    (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
+    return found
+
+
 def test_what_is_not_behind_by_the_odds_is_an_alternative(monkeypatch):
     found = evidence(monkeypatch)
     assert (found.effect, found.alternatives, found.preferred) == ("a", ("b",), "a")
@@ -131,9 +139,7 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
     search = search_of(model(), BEST, INDISTINGUISHABLE, DISTINGUISHABLE)
     effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
     search.evaluator = SimpleNamespace(available_effects=effects, has_linearisation=False)
-    monkeypatch.setattr(AlternativeFinder, "_compute_range_excess", lambda self, effect: 1.0)
-    monkeypatch.setattr(AlternativeFinder, "_compute_p_value", lambda self, rest, effect, gain: 0.0)
-    (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
+    found = significant_evidence(monkeypatch, search)
     assert found.alternatives == kept
     assert found.preferred == ("b" if family == "a" else "a")
 
@@ -153,7 +159,5 @@ def test_the_null_gain_of_one_of_two_signs_does_not_count_for_a_robot(
         coefficient_slices={"a": slice(0, 1), "b": slice(1, 2)},
     )
     search.get_effect_penalty = {"a": 0.0, "b": 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO}.get
-    monkeypatch.setattr(AlternativeFinder, "_compute_range_excess", lambda self, effect: 1.0)
-    monkeypatch.setattr(AlternativeFinder, "_compute_p_value", lambda self, rest, effect, gain: 0.0)
-    (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
+    found = significant_evidence(monkeypatch, search)
     assert found.alternatives == alternatives
