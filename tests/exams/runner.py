@@ -75,10 +75,7 @@ def run_exam(questions, folder, call, version, seed=0, jobs=2, fresh=False, agai
         return not own or not (fresh or (again and is_poor))
 
     rows = read_rows(path)
-    # Drawing a case may take as long as answering it, so it is done once for all versions.
-    saved = {
-        row["item"]: row["saved"] for row in rows if (row.get("saved") or {}).get("seed") == seed
-    }
+    saved = list_saved(rows, seed)
     rows = [row for row in rows if is_kept(row)]
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     answered = {row["item"] for row in rows if row["version"] == version}
@@ -115,7 +112,7 @@ def list_saved(rows, seed):
 
     Drawing a case may take as long as answering it, so it is done once for all versions.
     """
-    drawn = [(row["item"], row["saved"]) for row in rows if "saved" in row]
+    drawn = [(row["item"], row["saved"]) for row in rows if row.get("saved")]
     return {item: saved for item, saved in drawn if saved["seed"] == seed}
 
 

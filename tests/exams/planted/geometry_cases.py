@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from tests.exams.exam import Exam, Question, Target, UndrawableError
+from tests.exams.exam import Exam, Question, Target
 from tests.exams.marking import HiddenCause, mark_answer
 from tests.exams.planted.model_cases import ModelCase, draw_model_case
 from tests.exams.planted.planted_cases import STANDARD
 from tests.exams.planted.planted_motion import EFFECTS
-from tests.exams.planted.planted_robots import MissingModelError
 
 ARMS = ("arm-absent-meshes", "arm-filtered", "arm-included", "arm-inheritrange", "mobile-arm")
 SYSTEMS_BY_NUMBER = {
@@ -65,10 +64,7 @@ class GeometryQuestion(Question):
 
     def draw(self, seed=0):
         """Draw the case; another seed gives another exam."""
-        try:
-            return GeometryCase(**vars(draw_model_case(self, seed)))
-        except MissingModelError as error:
-            raise UndrawableError(str(error)) from error
+        return GeometryCase(**vars(draw_model_case(self, seed)))
 
 
 @dataclass(frozen=True)

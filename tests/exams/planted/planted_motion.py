@@ -263,10 +263,7 @@ class Operator:
         joints = model.actuator_trnid[:, 0]
         self.positions, self.dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self.gear = model.actuator_gear[:, 0].copy()
-        limited = model.actuator_ctrllimited.astype(bool)
-        low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
-        high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
-        self.range = low, high
+        self.range = command_range(model)
         # Use the inertia of a joint while the other joints are free. With the larger inertia of
         # locked joints the sampled loop would chatter.
         inertia = 1 / np.diag(np.linalg.inv(mass_matrix(model, pose)))[self.dofs]
@@ -301,6 +298,13 @@ class Operator:
             commands.append(self.command(simulator.data, wanted))
             simulator.advance(commands[-1])
         return Run(np.array(commands), positions, velocities)
+
+
+def command_range(model):
+    """Return the lowest and the highest controls (nu,); infinite without a limit."""
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = model.actuator_ctrlrange.T
+    return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
 
 def mass_matrix(model, pose):

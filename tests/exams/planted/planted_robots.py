@@ -16,13 +16,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from tests.exams.exam import UndrawableError
 from tests.exams.robots.exam_robots import Drive, compile_urdf, plain
 
 STIFF_SERVO = (2000.0, 100.0)
 """Gains kp (N m/rad) and kv (N m s/rad) of a stiff position servo."""
 
 
-class MissingModelError(Exception):
+class MissingModelError(UndrawableError):
     """The package that contains a model file is not installed."""
 
 

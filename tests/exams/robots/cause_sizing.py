@@ -194,15 +194,12 @@ class CompetingCauses:
 
     def _fitted(self, of, count, others):
         def residual(numbers):
-            return self._change(of(numbers) | others) - self.wanted
+            return self.fitted.change(of(numbers) | others) - self.wanted
 
         bounds = np.full(count, -1.0), np.full(count, 2.0)
         return self._error(
             of(fit_coefficients(residual, np.full(count, FIRST), *bounds, ROUNDS)) | others
         )
-
-    def _change(self, effects):
-        return self.fitted.change(effects)
 
     def _error(self, effects):
         return compute_rms(self.unseen - self.held.change(effects))

@@ -163,10 +163,14 @@ class _Course:
         return Motion(instants, q, v, force)
 
     def _row(self):
-        q, v = self.state[: self.count].copy(), self.state[self.count : 2 * self.count].copy()
+        q, v = (part.copy() for part in self._split_state(self.state))
         if self.elastic:
             q[self.elastic.joint], v[self.elastic.joint] = self._rotor(self.state)
         return q, v, self.drives.forces(self._commands(self.begin), q, v)
+
+    def _split_state(self, state):
+        """Return the positions and velocities of a state, each (N,)."""
+        return state[: self.count], state[self.count : 2 * self.count]
 
     def _rotor(self, state):
         return state[2 * self.count : 2 * self.count + 2]
@@ -275,17 +279,15 @@ class _Course:
 
     def _limit(self, t, state):
         """Return the largest dry friction of every joint, (N,)."""
-        q, v = state[: self.count], state[self.count : 2 * self.count]
-        loaded = self.plant.loads
+        q, v = self._split_state(state)
         if self.plant.heated:
             return self.plant.limit(t, q, v, heat=max(state[-1], 0.0))
-        drive = self.drives.forces(self._commands(t), q, v) if loaded else None
+        drive = self.drives.forces(self._commands(t), q, v) if self.plant.loads else None
         return self.plant.limit(t, q, v, drive)
 
     def _decide(self, t):
         """Decide which joints at rest are held, and the direction of the others."""
-        n = self.count
-        q, v = self.state[:n], self.state[n : 2 * n]
+        q, v = self._split_state(self.state)
         has_friction = self.world.has_friction
         limit = self._limit(t, self.state)
         resting = has_friction & (v == 0.0)
@@ -307,8 +309,7 @@ class _Course:
 
     def _force(self, t, state):
         """Return forces of actuators, damping, springs and biases, without dry friction, (N,)."""
-        n = self.count
-        q, v = state[:n], state[n : 2 * n]
+        q, v = self._split_state(state)
         if self.elastic:
             return self._elastic_forces(t, state)[0]
         force = self.drives.forces(self._commands(t), q, v) + self.plant.passive(t, q, v)
@@ -320,8 +321,8 @@ class _Course:
 
     def _elastic_forces(self, t, state):
         """Return the forces on arm and rotor; the damping of the file acts on the motor."""
-        n, soft = self.count, self.elastic
-        q, v = state[:n].copy(), state[n : 2 * n].copy()
+        soft = self.elastic
+        q, v = (part.copy() for part in self._split_state(state))
         link = q[soft.joint], v[soft.joint]
         q[soft.joint], v[soft.joint] = self._rotor(state)
         outer = self.drives.forces(self._commands(t), q, v) + self.plant.passive(t, q, v)
@@ -332,19 +333,17 @@ class _Course:
 
     def _holding(self, t, state):
         """Return friction of the held joints, (S,), and accelerations of all joints, (N,)."""
-        n = self.count
-        q, v = state[:n], state[n : 2 * n]
+        q, v = self._split_state(state)
         force = self._force(t, state) - self.sliding_direction * self._limit(t, state)
         rest = force - self.plant.needed(q, v)
         mass, free = self.plant.inertia(q), ~self.stuck
-        a = np.zeros(n)
+        a = np.zeros(self.count)
         if free.any():
             a[free] = np.linalg.solve(mass[np.ix_(free, free)], rest[free])
         return mass[self.stuck] @ a - rest[self.stuck], a
 
     def _rate(self, t, state):
-        n = self.count
-        q, v = state[:n], state[n : 2 * n]
+        q, v = self._split_state(state)
         if self.world.dry and self.stuck.any():
             a = self._holding(t, state)[1]
         else:

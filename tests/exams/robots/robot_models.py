@@ -68,7 +68,7 @@ def _arm2(rng):
     text = hanging(
         "arm2", lengths, masses, ("shoulder", "elbow"), damping=rng.uniform(0.05, 0.2, 2)
     )
-    return text, (), (0.0, 0.0)
+    return text, (0.0, 0.0)
 
 
 def _double(rng):
@@ -76,7 +76,7 @@ def _double(rng):
     text = hanging(
         "double", lengths, masses, ("upper", "lower"), damping=rng.uniform(5e-3, 1e-2, 2)
     )
-    return text, (), (0.0, 0.0)
+    return text, (0.0, 0.0)
 
 
 def _cartpole(rng):
@@ -90,7 +90,7 @@ def _cartpole(rng):
             rng.uniform(2e-3, 1e-2),
         ),
     )  # fmt: skip
-    return urdf("cartpole", *parts), (), (0.0, 0.0)
+    return urdf("cartpole", *parts), (0.0, 0.0)
 
 
 def _random(rng):
@@ -100,7 +100,7 @@ def _random(rng):
     names = tuple(f"j{k + 1}" for k in range(count))
     inertia = np.array([np.sum(masses[k:]) * np.sum(lengths[k:]) ** 2 / 3 for k in range(count)])
     text = hanging("random", lengths, masses, names, axes, rng.uniform(0.3, 1.0) * inertia)
-    return text, (), tuple(np.zeros(count))
+    return text, tuple(np.zeros(count))
 
 
 def example(name):
@@ -115,13 +115,13 @@ def example(name):
 
 def _ur5(rng):
     pose = np.array([0.0, -1.2, 1.4, -0.8, -1.2, 0.3]) + rng.uniform(-0.3, 0.3, 6)
-    return plain(example("ur_description/urdf/ur5_robot.urdf")), (), tuple(pose)
+    return plain(example("ur_description/urdf/ur5_robot.urdf")), tuple(pose)
 
 
 def _panda(rng):
     fingers = ("panda_finger_joint1", "panda_finger_joint2")
     pose = np.array([0.0, -0.4, 0.0, -1.9, 0.0, 1.6, 0.5]) + rng.uniform(-0.2, 0.2, 7)
-    return plain(example("panda_description/urdf/panda.urdf"), fingers), fingers, tuple(pose)
+    return plain(example("panda_description/urdf/panda.urdf"), fingers), tuple(pose)
 
 
 def _iiwa(rng):
@@ -129,7 +129,7 @@ def _iiwa(rng):
 
     path = Path(pybullet_data.__file__).parent / "kuka_iiwa/model.urdf"
     pose = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0]) + rng.uniform(-0.2, 0.2, 7)
-    return plain(path.read_text()), (), tuple(pose)
+    return plain(path.read_text()), tuple(pose)
 
 
 KINDS = {
@@ -156,7 +156,7 @@ def machine(name, rng, numerics=None):
         numerics: (step, integrator) that the recording specifies; (0.002, "RK4") if None.
     """
     kind, _, drive = name.partition("-")
-    text, _, pose = KINDS[kind](rng)
+    text, pose = KINDS[kind](rng)
     tilted = rng.uniform(-0.15, 0.15, 3) if drive == "motor" else rng.uniform(-0.6, 0.6, 3)
     if rng.random() < 0.5 and kind != "cartpole":
         text = plain(text, mount=tilted)
