@@ -21,7 +21,6 @@ from bench.diagnosis.kalman.kalman_recursions import (
     MAX_MAGNITUDE,
     SMALLEST_FORCE,
     Filtered,
-    IndependentPart,
     LinearRuns,
     Smoothed,
     add_noise_states,
@@ -406,19 +405,14 @@ class FollowedRuns:
         for part in coloured.independent_parts:
             # Indices from `force.size` on are those of coloured noise.
             coordinates = part.forces[part.forces < self.force.size]
-
-            def compute_log_likelihood(force: Array, part: IndependentPart = part) -> float:
-                """Return the log-likelihood of the part with these missing forces."""
-                filtered = filter_runs(part.runs, force, white[part.channels])
-                return float(filtered.log_likelihood.sum())
-
-            force = self.force[coordinates]
-            log_likelihood = compute_log_likelihood(force)
-            for index, coordinate in enumerate(coordinates.tolist()):
-                reduced = force.copy()
-                # Negligible: a tiny share of the typical force at this coordinate.
-                reduced[index] = SMALLEST_FORCE * self.typical[coordinate]
-                losses[coordinate] = 2.0 * (log_likelihood - compute_log_likelihood(reduced))
+            # First all forces, then one of them reduced to a tiny share of its typical size.
+            forces = np.tile(self.force[coordinates], (coordinates.size + 1, 1))
+            np.fill_diagonal(forces[1:], SMALLEST_FORCE * self.typical[coordinates])
+            log_likelihoods = [
+                filter_runs(part.runs, force, white[part.channels]).log_likelihood.sum()
+                for force in forces
+            ]
+            losses[coordinates] = 2.0 * (log_likelihoods[0] - np.array(log_likelihoods[1:]))
         return losses
 
     @property

@@ -111,17 +111,6 @@ class ModelFilters:
             theta[self.evaluator.base_indices[is_free]] = identified.base[is_free]
         return theta
 
-    def make_theta_with(self, name: str, coefficients: Array) -> Array:
-        """Return the reference parameters (P,) with the coefficients of one effect replaced.
-
-        Args:
-            name: name of the effect.
-            coefficients: (k,) its coefficients.
-        """
-        theta = self.reference.copy()
-        theta[self.evaluator.coefficient_slices[name]] = coefficients
-        return theta
-
     @property
     def base(self) -> FollowedRuns:
         """The runs, followed with the base model, which has no effects."""

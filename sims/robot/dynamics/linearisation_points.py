@@ -44,8 +44,6 @@ CONTACT_DIFFERENCE = 1e-6
 """Displacement in m of a floating body, for derivatives that show its contacts."""
 MAX_RELATIVE_CHANGE = 0.1
 """Maximum change of these derivatives for which one linearisation is used."""
-JOINT_TRANSMISSIONS = (0, 1)
-"""Types of MuJoCo's transmissions that act on one joint: mjTRN_JOINT, mjTRN_JOINTINPARENT."""
 TRANSMISSION_FORCE_FIELDS = ("qfrc_actuator", "qfrc_bias")
 """Fields of MuJoCo's data with the forces on both sides of a joint's transmission."""
 
@@ -97,40 +95,31 @@ class RobotMotion:
 
 
 class LimbNumbers(NamedTuple):
-    """Number of the limb of each component of a robot with several limbs.
+    """Number of the limb of each component of a robot whose limbs do not influence each other.
 
     Attributes:
-        joints: (D,) of the joints.
-        controls: (nu,) of the controls.
-        activations: (na,) of the activations.
-        outputs: (O,) of the outputs.
+        joints: (D,) limb of each joint, with its position, velocity and force.
+        controls: (nu,) limb of each control.
+        activations: (na,) limb of each activation.
+        results: (D,) limb of each acceleration, or (Z,) of each component of a state.
+        outputs: (O,) limb of each output.
     """
 
     joints: IndexArray
     controls: IndexArray
     activations: IndexArray
+    results: IndexArray
     outputs: IndexArray
 
     def get_number(self, quantity: str, index: int) -> int:
-        """Return the limb of a component.
+        """Return the limb of a component that is displaced.
 
         Args:
-            quantity: ``u`` for a control, ``a`` for an activation; positions, velocities and forces
-                are those of joints.
+            quantity: quantity as in `LinearisationPoints.step_displaced`.
             index: number of the component among those of its quantity.
         """
         numbers = {"u": self.controls, "a": self.activations}.get(quantity, self.joints)
         return int(numbers[index])
-
-    def number_results(self, size: int) -> IndexArray:
-        """Return the limb of each acceleration (D,), or of each component of a state (Z,).
-
-        Args:
-            size: number of these components.
-        """
-        if size == self.joints.size:
-            return self.joints
-        return np.concatenate([self.joints, self.joints, self.activations])
 
 
 class LinearisationPoints:
@@ -266,32 +255,36 @@ class LinearisationPoints:
 
     @property
     def limbs(self) -> LimbNumbers | None:
-        """Numbers of the limbs: kinematic trees that do not influence each other.
+        """Limbs of the robot: kinematic trees that do not influence each other.
 
-        None if forces may pass between trees: through contacts, equality constraints, tendons,
-        drives that are not at a joint, or effects that are evaluated in every step.
+        None if there is only one, or if forces may pass from tree to tree: through contacts,
+        equality constraints, tendons, drives that are not at a joint, or effects that are evaluated
+        in every step.
         """
-        model = self._mujoco_batch.model
-        is_passed_on = (
+        robot, model = self._mujoco_batch.robot, self._mujoco_batch.model
+        may_pass_forces = (
             self.has_contacts
             or bool(self._floating)
             or any(self._step_effects)
             or model.nv != self.motion.x.shape[1]
             or bool(model.neq or model.ntendon or model.nplugin)
-            or not np.isin(model.actuator_trntype, JOINT_TRANSMISSIONS).all()
-            or bool((self._joint_of_output < 0).any())
+            or any(actuator.joint is None for actuator in robot.actuators)
+            or self.reads_others
         )
-        if is_passed_on or model.ntree < 2:
+        if may_pass_forces or model.ntree < 2:
             return None
-        of_joint = np.asarray(model.dof_treeid)[self._joints.velocities]
-        of_actuator = model.dof_treeid[model.jnt_dofadr[model.actuator_trnid[:, 0]]]
-        # Actuators with activations, in the order of these.
-        with_activation = np.flatnonzero(model.actuator_actadr >= 0)
-        order = np.argsort(model.actuator_actadr[with_activation], kind="stable")
-        of_activation = np.repeat(
-            of_actuator[with_activation[order]], model.actuator_actnum[with_activation[order]]
-        )
-        return LimbNumbers(of_joint, of_actuator, of_activation, of_joint[self._joint_of_output])
+        joints = np.asarray(model.dof_treeid)[self._joints.velocities]
+        controls, activations = np.zeros(model.nu, dtype=int), np.zeros(model.na, dtype=int)
+        for actuator in robot.actuators:
+            assert actuator.joint is not None
+            limb = model.dof_treeid[robot.joint(actuator.joint).velocity]
+            controls[actuator.control : actuator.control + actuator.controls] = limb
+            # The address is -1 without activations.
+            first = max(model.actuator_actadr[actuator.id], 0)
+            activations[first : first + model.actuator_actnum[actuator.id]] = limb
+        states = np.concatenate([joints, joints, activations])
+        results = joints if self.steps_joints_by_runge_kutta else states
+        return LimbNumbers(joints, controls, activations, results, joints[self._joint_of_output])
 
     @property
     def steps_joints_by_runge_kutta(self) -> bool:

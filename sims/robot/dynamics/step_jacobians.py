@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.robot.dynamics.linearisation_points import LimbNumbers, LinearisationPoints
+from sims.robot.dynamics.linearisation_points import Displacements, LimbNumbers, LinearisationPoints
 
 POSITION_DIFFERENCE, VELOCITY_DIFFERENCE, CONTROL_DIFFERENCE, FORCE_DIFFERENCE_SHARE = (
     1e-6,
@@ -130,31 +130,26 @@ def compute_difference_quotients(
     for group in displacements.values():
         derivatives = np.zeros((*unchanged_results.shape, len(group)))
         reading_derivatives = np.zeros((*unchanged_readings.shape, len(group)))
-        if limbs is not None:
-            for name, columns in _list_joint_displacements(group, limbs):
-                indices = np.array([group[column][1] for column in columns])
-                sizes = np.array([group[column][2] for column in columns])
-                results, readings = evaluate(moved={name: (indices, sizes)})
-                # Each limb shows the derivatives by its own displacement.
-                for column, index, size in zip(columns, indices, sizes, strict=True):
-                    limb = limbs.get_number(name, index)
-                    rows = limbs.number_results(results.shape[1]) == limb
-                    derivatives[:, rows, column] = (results - unchanged_results)[:, rows] / size
-                    rows = limbs.outputs == limb
-                    changes = readings - unchanged_readings
-                    reading_derivatives[:, rows, column] = changes[:, rows] / size
-            quotients.append((derivatives, reading_derivatives))
-            continue
-        for column, (name, j, difference) in enumerate(group):
-            results, readings = evaluate(moved={name: (j, difference)})
-            forward = (results - unchanged_results) / difference
-            derivatives[:, :, column] = forward
-            reading_derivatives[:, :, column] = (readings - unchanged_readings) / difference
+        for columns in _list_simultaneous_displacements(group, limbs):
+            moved = _make_displacement([group[column] for column in columns])
+            results, readings = evaluate(moved=moved)
+            for column in columns:
+                name, j, difference = group[column]
+                # A limb shows the derivatives by its own displacement.
+                rows = outputs = np.s_[:]
+                if limbs is not None:
+                    limb = limbs.get_number(name, j)
+                    rows, outputs = limbs.results == limb, limbs.outputs == limb
+                change = (results - unchanged_results)[:, rows]
+                derivatives[:, rows, column] = change / difference
+                change = (readings - unchanged_readings)[:, outputs]
+                reading_derivatives[:, outputs, column] = change / difference
+            # With contacts, there is one displacement at a time.
             if name == "q" and points.has_contacts:
                 # The force of a contact that begins or ends within the difference jumps.
                 results, readings = evaluate(moved={name: (j, -difference)})
                 backward = (unchanged_results - results) / difference
-                is_smaller = np.abs(backward).max(1) < np.abs(forward).max(1)
+                is_smaller = np.abs(backward).max(1) < np.abs(derivatives[:, :, column]).max(1)
                 derivatives[is_smaller, :, column] = backward[is_smaller]
                 backward_readings = (unchanged_readings - readings) / difference
                 reading_derivatives[is_smaller, :, column] = backward_readings[is_smaller]
@@ -170,26 +165,36 @@ def compute_difference_quotients(
     )
 
 
-def _list_joint_displacements(
-    displacements: Sequence[tuple[str, int, float]], limbs: LimbNumbers
-) -> list[tuple[str, list[int]]]:
-    """List the displacements that are made together: of one quantity, and one of each limb.
+def _list_simultaneous_displacements(
+    displacements: Sequence[tuple[str, int, float]], limbs: LimbNumbers | None
+) -> list[list[int]]:
+    """List the displacements that are made together: of one quantity, one in each limb.
 
     Args:
         displacements: quantity, index and size of each displacement.
-        limbs: limb of each component of the robot.
+        limbs: limb of each component of the robot; None if displacements are made one by one.
 
     Returns:
-        Quantity, and the positions of its displacements in `displacements`.
+        Positions in `displacements` of those that are made together.
     """
-    # The number of earlier displacements of the same quantity and limb is that of the evaluation.
+    if limbs is None:
+        return [[position] for position in range(len(displacements))]
+    # The number of earlier displacements of the same quantity in the same limb is that of the step.
     counts: Counter[tuple[str, int]] = Counter()
     together: dict[tuple[str, int], list[int]] = {}
-    for column, (name, index, _) in enumerate(displacements):
+    for position, (name, index, _) in enumerate(displacements):
         key = name, limbs.get_number(name, index)
-        together.setdefault((name, counts[key]), []).append(column)
+        together.setdefault((name, counts[key]), []).append(position)
         counts[key] += 1
-    return [(name, columns) for (name, _), columns in together.items()]
+    return list(together.values())
+
+
+def _make_displacement(displacements: Sequence[tuple[str, int, float]]) -> Displacements:
+    """Return displacements of one quantity, as `LinearisationPoints.step_displaced` takes them."""
+    names, indices, sizes = zip(*displacements, strict=True)
+    if len(displacements) == 1:
+        return {names[0]: (indices[0], sizes[0])}
+    return {names[0]: (np.array(indices), np.array(sizes))}
 
 
 def compute_runge_kutta_step(

@@ -99,12 +99,12 @@ def autoregressive(evaluator, sigma, phi):
 def fit_model(
     evaluator, noise, effects=(), theta=None, states=None, iterations=20, **fitter_options
 ):
-    """Fit one model, by default from its nominal parameters and the guessed initial states."""
-    start = FitStart(
-        effects,
-        evaluator.get_nominal_theta() if theta is None else np.array(theta),
-        evaluator.initial_state_guesses if states is None else states,
-    )
+    """Fit one model, by default from its nominal parameters and the estimated initial states."""
+    if theta is None:
+        theta = evaluator.get_nominal_theta()
+    if states is None:
+        states = evaluator.initial_state_guesses
+    start = FitStart(effects, np.array(theta), states)
     (fit,) = TrajectoryFitter(evaluator, noise, **fitter_options).fit_models([start], iterations)
     return fit
 

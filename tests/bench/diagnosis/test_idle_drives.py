@@ -76,8 +76,8 @@ def test_the_planted_damping_is_found(tmp_path, given):
     }
     assert sum(notes[given] in line for line in lines) == 1
     # The note follows the headline and precedes the first coefficient.
-    told = summary_text(found.story).lower()
-    assert told.index(notes[given].lower()) < told.index("coefficient")
+    summary = summary_text(found.story).lower()
+    assert summary.index(notes[given].lower()) < summary.index("coefficient")
     found.write(tmp_path / "out")
     (note,) = check((tmp_path / "out" / "verdict.json").read_text())["recording_notes"]
     assert notes[given] in note

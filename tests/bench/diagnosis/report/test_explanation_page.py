@@ -92,11 +92,11 @@ def cells(text, first):
 def test_every_verdict_makes_a_sound_page_that_begins_with_its_headline(verdict):
     from bench.diagnosis.report.summary_text import format_headline
 
-    told = make_report(verdict)
-    html = render_page(told)
+    report = make_report(verdict)
+    html = render_page(report)
     reader = Reader(html)
     assert html.startswith("<!DOCTYPE html>\n<html lang=")
-    assert reader.headline == format_headline(told)
+    assert reader.headline == format_headline(report)
     assert reader.tags.count("title") == reader.tags.count("h1") == 1
     assert reader.tags.index("h1") < reader.tags.index("h2") < reader.tags.index("img")
     assert re.findall(r"<h2[^>]*>([^<]*)", html)[:2] == [
@@ -133,11 +133,11 @@ def test_texts_from_files_and_plugins_are_escaped():
 
 def test_attributes_cannot_be_escaped_from():
     quote = '" onerror="alert(1)'
-    told = make_report()
+    report = make_report()
     named = replace(
-        told, parameters=tuple(replace(p, name=quote) for p in told.parameters), title=quote
+        report, parameters=tuple(replace(p, name=quote) for p in report.parameters), title=quote
     )
-    named = replace(named, channels=tuple(replace(c, name=quote) for c in told.channels))
+    named = replace(named, channels=tuple(replace(c, name=quote) for c in report.channels))
     assert not [a for a in Reader(render_page(named)).attributes if a[1].startswith("on")]
 
 
@@ -164,8 +164,8 @@ def test_figures_are_embedded_with_alternatives_that_say_what_they_show():
 
 
 def test_numbers_are_those_of_the_report_data():
-    told = make_report(causes=[DRAG, TILT])
-    html = render_page(told)
+    report = make_report(causes=[DRAG, TILT])
+    html = render_page(report)
     text = Reader(html).text
     assert "Together they close 90 % of the gap (85 to 94 %)" in text
     assert "90 % of the gap closed (85 to 94 %)" in text
@@ -188,14 +188,14 @@ def test_numbers_are_those_of_the_report_data():
 
 
 def test_errors_of_channels_are_recomputed_from_the_runs():
-    told = make_report()
-    row = cells(render_page(told), "qd")
+    report = make_report()
+    row = cells(render_page(report), "qd")
     assert row[:3] == ["qd", "0.05 rad/s", "estimated, steps of 0.002"]
-    for column, side in ((3, told.fitting), (5, told.held_out)):
+    for column, side in ((3, report.fitting), (5, report.held_out)):
         for i, simulated in enumerate((side.before, side.after)):
             left = (side.observed - simulated)[:, :, 1]
             assert row[column + i] == f"{np.sqrt(np.nanmean(left**2)):.3g} rad/s"
-    empty = replace(told.fitting, observed=np.full_like(told.fitting.observed, np.nan))
+    empty = replace(report.fitting, observed=np.full_like(report.fitting.observed, np.nan))
     assert np.isnan(compute_channel_errors(empty)).all()
 
 
@@ -258,11 +258,11 @@ def test_gaps_in_what_is_known_do_not_break_the_page():
 
 
 def test_many_runs_are_cut_to_the_worst():
-    told = make_report()
+    report = make_report()
     many = replace(
-        told,
+        report,
         gap_locations=tuple(
-            replace(told.gap_locations[0], label=f"r{i}", before=float(i)) for i in range(1, 500)
+            replace(report.gap_locations[0], label=f"r{i}", before=float(i)) for i in range(1, 500)
         ),
     )
     html = render_report(many, {})
@@ -273,8 +273,8 @@ def test_many_runs_are_cut_to_the_worst():
 
 
 def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them():
-    told = replace(make_report("ambiguous"), path=Path("my logs/it's <b>.csv"))
-    html = render_page(told, Path("out dir"))
+    report = replace(make_report("ambiguous"), path=Path("my logs/it's <b>.csv"))
+    html = render_page(report, Path("out dir"))
     said = [unescape(text) for text in re.findall(r'<pre class="copied"[^>]*>([^<]*)', html)]
     assert [shlex.split(text) for text in said] == [
         ["simgap", "design", "my logs/it's <b>.csv", "--out", "next.csv"],
@@ -282,7 +282,7 @@ def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them():
         ["simgap", "score", "out dir/extended.toml", "OTHER.csv"],
     ]
     # A page without a folder has no extended.toml to refer to.
-    assert "extended.toml" not in render_page(told)
+    assert "extended.toml" not in render_page(report)
     unknown = read_page(make_report("unknown"))
     assert "--plugin my_effect.py" in unknown
     assert "--check" in read_page(make_report("unidentifiable"))
@@ -333,8 +333,8 @@ def test_what_can_be_fixed_does_not_contradict_the_headline(verdict):
         ParameterIdentifiability(n, False, "1", np.inf, 0.0, 1.0, "not identifiable", ())
         for n in names
     ]
-    told = make_report(verdict, identifiability=tuple(numbers))
-    text = render_page(told)
+    report = make_report(verdict, identifiability=tuple(numbers))
+    text = render_page(report)
     said = Reader(text).text.partition("Of 3 causes, ")[2].partition("Where the gap is")[0]
     lost = "not visible in these data"
     standings = [cells(text, f"<code>{name}</code>")[1] for name in names]
